@@ -60,6 +60,7 @@ from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
@@ -132,6 +133,7 @@ __all__ = [
     "SeriesPosterior",
     "StudentT",
     "Summary",
+    "SwitchingKalmanFilter",
     "Truncated",
     "Uniform",
     "UnscentedKalmanFilter",

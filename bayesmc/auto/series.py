@@ -16,6 +16,7 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refus
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior
@@ -25,11 +26,13 @@ _CANDIDATES: tuple[type[FilterEngine], ...] = (
     DiscreteFilter,
     KalmanFilter,
     GridFilter,
+    SwitchingKalmanFilter,
     ParticleFilter,
 )
 _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
+    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate",
     "ParticleFilter": "every hidden node can be sampled given its parents",
     "GridFilter": "hidden nodes are finite, angles, on bounded intervals, or the one number of a slice",
 }

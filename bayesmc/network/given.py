@@ -24,13 +24,20 @@ from bayesmc.network.readings import Argument, Probe, hold_against, read_functio
 from bayesmc.shapes import broadcast_shapes
 
 
-def read_given(model: Model, name: str, values: Mapping[str, np.ndarray]) -> Any:
+def read_given(
+    model: Model,
+    name: str,
+    values: Mapping[str, np.ndarray],
+    cut: frozenset[str] = frozenset(),
+) -> Any:
     """What a node's function computes where values are known, of what else it depends on.
 
     Parameters
     ----------
     values : dict
         Stored values of some nodes, a batch in front or not; the result has the batch in its shapes.
+    cut : frozenset of str, optional
+        Deterministic nodes that are leaves where their values are not known.
 
     Returns
     -------
@@ -56,14 +63,14 @@ def read_given(model: Model, name: str, values: Mapping[str, np.ndarray]) -> Any
     <Elementwise multiply ()>
     """
     known = dict(values)
-    above = [n for n in deterministic_above(model, name, ()) if n not in known]
+    above = [n for n in deterministic_above(model, name, cut) if n not in known]
     for other in (*above, name):
         if all(p in known for p in model[other].parents):
             found = model.evaluate(other, known)[0]
             if other == name:
                 return found if isinstance(found, Distribution) else constant(found)
             known[other] = found
-    result = _read(model, name, known)
+    result = _read(model, name, known, cut)
     _check(model, name, known, result)
     return result
 
@@ -71,7 +78,7 @@ def read_given(model: Model, name: str, values: Mapping[str, np.ndarray]) -> Any
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _read(model: Model, name: str, known: Mapping[str, np.ndarray]) -> Any:
+def _read(model: Model, name: str, known: Mapping[str, np.ndarray], cut: frozenset[str]) -> Any:
     node = model[name]
     if node.declaration.vectorize:
         raise TraceError("it is called element by element (vectorize=True)")
@@ -81,10 +88,10 @@ def _read(model: Model, name: str, known: Mapping[str, np.ndarray]) -> Any:
         stored: Expression
         if parent in known:
             stored = constant(known[parent])
-        elif above.kind != "deterministic":
+        elif above.kind != "deterministic" or parent in cut:
             stored = stored_leaf(model, above)
         elif above.domain is None:
-            found = as_expression(_read(model, parent, known))
+            found = as_expression(_read(model, parent, known, cut))
             stored = broadcast(found, broadcast_shapes(found.shape, above.value_shape))
         else:
             raise TraceError(f"node {parent!r} takes finitely many values")

@@ -161,7 +161,8 @@ def linear_node(
     try:
         if isinstance(found, Opaque) and above == found.leaves:  # nothing that is known would help
             raise TraceError(found.reason)
-        result = read_given(model, name, {n: values[n] for n in values if n not in above})
+        known = {n: values[n] for n in values if n not in above}
+        result = read_given(model, name, known, cut)
     except TraceError as error:
         on = f"depends on the continuous {_nodes(model, above)} in a way that " if above else ""
         raise NotLinearError(f"{on}cannot be traced ({error})") from error

@@ -7,7 +7,7 @@ ones of which some are given. Which of them are given makes the pattern of a sli
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -53,6 +53,12 @@ class Pattern:
 class SeriesData:
     """The data of a problem.
 
+    Parameters
+    ----------
+    problem : SeriesProblem
+    given : frozenset of str
+        Further nodes whose values layouts count as known, though no data say them.
+
     Attributes
     ----------
     layouts : tuple of Layout
@@ -61,11 +67,11 @@ class SeriesData:
         Nodes with a density that are seen in full throughout.
     """
 
-    def __init__(self, problem: SeriesProblem) -> None:
+    def __init__(self, problem: SeriesProblem, given: frozenset[str] = frozenset()) -> None:
         slices, series = problem.slices, problem.series
         self.slices, self.series, self.steps = slices, series, series.steps
         self.known = frozenset(n for n, o in series.observed.items() if o.mask is None)
-        unknown = always_unknown(slices, self.known)
+        unknown = always_unknown(slices, self.known | given)
         apart = plates_apart(slices)
         before = tuple(n for n in slices.interface if n in unknown)
         self.layouts = (
@@ -74,7 +80,8 @@ class SeriesData:
         )
         self.static = {n: o.value for n, o in series.static.items()}
         self._computed: dict[str, np.ndarray] = {}
-        if any(n in slices.interface for layout in self.layouts for n in layout.computed):
+        self._plain = tuple(_computed_by_data(layout, given) for layout in self.layouts)
+        if any(n in slices.interface for names in self._plain for n in names):
             self._computed = self._values_computed(self.steps)
 
     def layout(self, k: int) -> Layout:
@@ -148,7 +155,7 @@ class SeriesData:
 
     def computed(self, steps: int) -> dict[str, np.ndarray]:
         """Values in the first slices of deterministic nodes that are known throughout, time first."""
-        names = set(self.layouts[0].computed) & set(self.layouts[1].computed)
+        names = set(self._plain[0]) & set(self._plain[1])
         if not names:
             return {}
         found = self._computed or self._values_computed(steps)
@@ -171,7 +178,7 @@ class SeriesData:
         for k in range(steps):
             layout, values = self.layout(k), {**self.at(k), **before}
             before = {}
-            for name in layout.computed:
+            for name in self._plain[min(k, 1)]:
                 with in_slice(k):
                     value = layout.model.evaluate(name, values)[0]
                 values[name] = value
@@ -256,6 +263,19 @@ def certain_density(layout: Layout, at: Mapping[str, np.ndarray]) -> Any:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _computed_by_data(layout: Layout, given: Collection[str]) -> tuple[str, ...]:
+    """Deterministic nodes whose value data say, parents first: those that depend on none of ``given``."""
+    below = set(given)
+    while True:  # what depends on the slice before may stand ahead of it
+        more = {
+            n for n in layout.computed
+            if any(p.removesuffix(PREVIOUS) in below for p in layout.model[n].parents)
+        }  # fmt: skip
+        if more <= below:
+            return tuple(n for n in layout.computed if n not in below)
+        below |= more
 
 
 def _places(layout: Layout, given: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

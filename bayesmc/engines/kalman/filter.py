@@ -315,6 +315,10 @@ class KalmanFilter(GaussianFilter):
 
 def _others(*layouts: Layout) -> str:
     """Filters that take such slices."""
+    for layout in layouts:
+        nodes = [layout.model[n] for n in layout.drawn]
+        if any(n.domain is not None for n in nodes) and any(n.domain is None for n in nodes):
+            return "use SwitchingKalmanFilter or ParticleFilter"
     if any(layout.silent or why_not_matched(layout) is not None for layout in layouts):
         return "use ParticleFilter"
     return "use ExtendedKalmanFilter, UnscentedKalmanFilter or ParticleFilter"

@@ -6,7 +6,7 @@ followed only where the index of the slice, inputs or observed nodes are known a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import nullcontext
 from typing import Any, NamedTuple
 
@@ -96,9 +96,7 @@ def read_linear(layout: Layout, values: Mapping[str, np.ndarray], count: int) ->
     timed = {n: v for n, v in values.items() if n not in static}
     fixed = {n: v for n, v in values.items() if n in static}
     if not reads_time(layout):
-        return _collapsed(
-            layout, _composed(layout, fixed | {n: v[0] for n, v in timed.items()}, ())
-        )
+        return _collapsed(layout, composed(layout, fixed | {n: v[0] for n, v in timed.items()}, ()))
     size = (layout.n_prev + layout.n) * max(layout.n + layout.p, 1) * max(
         int(np.prod(layout.lead)), 1
     )  # fmt: skip
@@ -110,14 +108,14 @@ def read_linear(layout: Layout, values: Mapping[str, np.ndarray], count: int) ->
     return _collapsed(layout, Linear(*(np.concatenate(p) for p in zip(*parts, strict=True))))
 
 
-def reads_time(layout: Layout) -> bool:
-    """Whether functions read what differs from slice to slice."""
+def reads_time(layout: Layout, still: Collection[str] = ()) -> bool:
+    """Whether functions read what differs from slice to slice; what is known and ``still`` does not."""
     template = layout.slices.template
     changing = {TIME, TIME + PREVIOUS, *template.inputs, *(n + PREVIOUS for n in template.inputs)}
     free = {n + PREVIOUS for n in layout.before} | layout.unknown
     for name in layout.order:
         for parent in layout.model[name].parents:
-            known = parent not in free and parent not in template.static
+            known = parent not in free and parent not in template.static and parent not in still
             if parent in changing or known:
                 return True
     return False
@@ -133,34 +131,13 @@ def typical_sizes(layout: Layout, name: str) -> np.ndarray:
     return 2.0 ** np.clip(np.round(np.log2(sizes)), -1000, 1000)
 
 
-# ---- private ------------------------------------------------------------------------------------
+def composed(layout: Layout, known: dict[str, np.ndarray], batch: tuple[int, ...]) -> Linear:
+    """Matrices for a batch of known values, or with ``()`` for one by itself, whose axis has length 1.
 
-
-def _linear(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> LinearNode:
-    """A node as an affine function of unknown ones with a density, and of the slice before."""
-    model = layout.model
-    hidden = {n + PREVIOUS for n in layout.before}.union(layout.drawn)
-    known = {n: np.asarray(v) for n, v in values.items() if n in model.nodes}
-    leaves = frozenset(n for n in (*hidden, *known) if model[n].kind == "deterministic")
-    return linear_node(model, name, hidden, leaves, known)
-
-
-def _together(
-    layout: Layout, fixed: dict[str, np.ndarray], timed: dict[str, np.ndarray], count: int
-) -> Linear:
-    """Slices at once, or one by one where functions do not take arrays of slices."""
-    try:
-        return _composed(layout, fixed | timed, (count,))
-    except (ModelError, ParameterError, UnsupportedError):  # one by one they say in which slice
-        parts = []
-        for k in range(count):
-            with in_slice(int(timed[TIME][k])) if TIME in timed else nullcontext():
-                parts.append(_composed(layout, fixed | {n: v[k] for n, v in timed.items()}, ()))
-        return Linear(*(np.concatenate(p) for p in zip(*parts, strict=True)))
-
-
-def _composed(layout: Layout, known: dict[str, np.ndarray], batch: tuple[int, ...]) -> Linear:
-    """Matrices of ``count`` slices (``batch`` is ``(count,)``, or ``()`` for one by itself)."""
+    Raises
+    ------
+    UnsupportedError, ParameterError
+    """
     lead, n, total = layout.lead, layout.n_prev, layout.p + layout.n
     values = dict(known)
     for name in layout.computed:
@@ -187,6 +164,32 @@ def _composed(layout: Layout, known: dict[str, np.ndarray], batch: tuple[int, ..
             put_noise(rows[..., place, own], found.scale if batch else found.scale[None])
             spent = own.stop
     return Linear(offset, rows[..., :n], rows[..., n:])
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _linear(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> LinearNode:
+    """A node as an affine function of unknown ones with a density, and of the slice before."""
+    model = layout.model
+    hidden = {n + PREVIOUS for n in layout.before}.union(layout.drawn)
+    known = {n: np.asarray(v) for n, v in values.items() if n in model.nodes}
+    leaves = frozenset(n for n in (*hidden, *known) if model[n].kind == "deterministic")
+    return linear_node(model, name, hidden, leaves, known)
+
+
+def _together(
+    layout: Layout, fixed: dict[str, np.ndarray], timed: dict[str, np.ndarray], count: int
+) -> Linear:
+    """Slices at once, or one by one where functions do not take arrays of slices."""
+    try:
+        return composed(layout, fixed | timed, (count,))
+    except (ModelError, ParameterError, UnsupportedError):  # one by one they say in which slice
+        parts = []
+        for k in range(count):
+            with in_slice(int(timed[TIME][k])) if TIME in timed else nullcontext():
+                parts.append(composed(layout, fixed | {n: v[k] for n, v in timed.items()}, ()))
+        return Linear(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
 
 def _at_zero(

@@ -77,15 +77,13 @@ def random_linear_dbn(seed: int, vague: float = 1e3) -> LinearSeries:
     >>> case.steps == len(case.observations[max(case.observations)])
     True
     """
-    return _Maker(seed, vague).made()
+    return LinearMaker(seed, vague).made()
 
-
-# ---- private ------------------------------------------------------------------------------------
 
 _SIZES = {"site": 3, "run": 2}
 
 
-class _Maker:
+class LinearMaker:
     """Declares one template from random choices."""
 
     def __init__(self, seed: int, vague: float) -> None:
@@ -170,7 +168,7 @@ class _Maker:
         if any(p.endswith("_prev") for p in parents):
             scale = self.vague if self.rng.random() < 0.1 else None
             function = self._function(name, tuple(initial), scale)
-            first = _named(function, tuple(initial))
+            first = named(function, tuple(initial))
         self.dbn.add(
             name, self._function(name, parents), parents, plates=self.within[name], initial=first
         )
@@ -185,7 +183,7 @@ class _Maker:
             parents = (*names, "d_prev")
             self.dbn.add(
                 "d", lambda *values: terms(values[:-1]) + 0.5 * values[-1], parents, plates=plates,
-                initial=_named(lambda *values: terms(values), names),
+                initial=named(lambda *values: terms(values), names),
             )  # fmt: skip
         else:
             self.dbn.add("d", lambda *values: terms(values), names, plates=plates)
@@ -240,7 +238,7 @@ class _Maker:
         return lambda v: number * read(v)
 
 
-def _named(function: Callable[..., Any], parents: tuple[str, ...]) -> Callable[..., Any]:
+def named(function: Callable[..., Any], parents: tuple[str, ...]) -> Callable[..., Any]:
     """The function with arguments of these names, as ``initial=`` reads them."""
 
     def call(*values: Any) -> Any:

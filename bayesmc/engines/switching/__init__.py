@@ -1,0 +1,1 @@
+"""Switching Kalman filters: finite modes, and states that are linear-Gaussian given them."""

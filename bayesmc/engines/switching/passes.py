@@ -1,0 +1,254 @@
+"""Forward over the slices of a switching system, and back: one mixture over modes is carried along.
+
+Forward, every mode has a Gaussian. What the rules differ in is when Gaussians are merged: GPB2 takes all of
+them through all modes of the next slice and merges what meets in a mode; IMM merges before, with the weights
+that the next mode gives them; GPB1 carries one Gaussian, merged over all modes.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.categorical import log_sum_exp
+from bayesmc.engines.kalman.covariances import full_factor
+from bayesmc.engines.kalman.data import Pattern
+from bayesmc.engines.kalman.means import absorbed
+from bayesmc.engines.kalman.slices import Layout
+from bayesmc.engines.switching.merging import Mixture, merged, shares
+from bayesmc.engines.switching.stretches import Stretch
+from bayesmc.linalg.square_root import Conditioned, condition, multiplied
+
+
+class Place(NamedTuple):
+    """A slice with its row.
+
+    Attributes
+    ----------
+    stretch : Stretch
+    at : int
+        Which slice of the stretch.
+    pattern : Pattern
+    row : ndarray, shape (*lead, observed)
+    given : ndarray, shape (*lead, n), or None
+        Values of unknown numbers that are observed.
+    """
+
+    stretch: Stretch
+    at: int
+    pattern: Pattern
+    row: np.ndarray
+    given: np.ndarray | None
+
+    @property
+    def layout(self) -> Layout:
+        return self.stretch.layout
+
+
+def nothing(layout: Layout) -> Mixture:
+    """What stands before slice 0."""
+    lead = layout.lead
+    return Mixture(np.zeros((1, *lead)), np.zeros((1, *lead, 0)), np.zeros((1, *lead, 0, 0)))
+
+
+def advanced(
+    merging: str, before: Mixture | None, place: Place
+) -> tuple[Mixture, np.ndarray, Conditioned]:
+    """The modes of a slice given its row and those before, and the log density of the row.
+
+    Parameters
+    ----------
+    merging : str
+        "gpb1", "imm" or "gpb2".
+    before : Mixture or None
+        Of the modes of the slice before, normalised; None in slice 0.
+
+    Returns
+    -------
+    Mixture
+        Weights sum to one over the modes.
+    ndarray, shape (*lead,)
+    Conditioned
+    """
+    stretch = place.stretch
+    pairs = stretch.pairs
+    by_kind = merging != "gpb2" or len(pairs.of_kind) == len(pairs.dst)
+    ahead = _ahead(merging, before, place)
+    after, log, made = taken(place, by_kind, ahead.mean, ahead.factor)
+    joint = ahead.log + log
+    increment = log_sum_exp(joint, axis=0)
+    factor = roots_of(place, made, after.shape[:-1])
+    by_dst = pairs.kinds_by_dst if by_kind else pairs.by_dst
+    log = joint - np.where(increment > -np.inf, increment, 0.0)
+    if by_dst.are_single:
+        return Mixture(log, after, factor), increment, made
+    members = by_dst.members
+    return merged(by_dst.logs(log), after[members], factor[members]), increment, made
+
+
+def taken(
+    place: Place, by_kind: bool, mean: np.ndarray, factor: np.ndarray, turning: bool = False
+) -> Any:
+    """Kinds or pairs given a row: means, log densities of the row, and what conditions them.
+
+    With ``turning`` standardised innovations are last.
+    """
+    layout, pattern = place.layout, place.pattern
+    expected, rows, terms = place.stretch.expected(place.at, pattern, by_kind, mean, factor)
+    made = condition(rows, len(pattern.observed), layout.n_prev if turning else None)
+    after, eta, log = absorbed(layout, pattern, made, expected, place.row, place.given, terms=terms)
+    return (after, log, made, eta) if turning else (after, log, made)
+
+
+def roots_of(place: Place, made: Conditioned, shape: tuple[int, ...]) -> np.ndarray:
+    """Roots of the covariances of all unknown numbers."""
+    factor = full_factor(place.layout, place.pattern, made.factor)
+    if factor.shape[:-2] == shape:
+        return factor
+    return np.broadcast_to(factor, shape + factor.shape[-2:])
+
+
+class Back(NamedTuple):
+    """Every pair of modes, as a smoother goes back through it.
+
+    The noise of the slice before is ``shift + link @ (noise of this slice)``, and what ``rest`` multiplies.
+
+    Attributes
+    ----------
+    log : ndarray, shape (pairs, *lead)
+        Log probabilities of the mode before given this one and the rows before.
+    after : Mixture
+        Of this slice, as the filter has them in every pair; of the numbers carried along.
+    shift : ndarray, shape (pairs, *lead, carried)
+    link : ndarray, shape (pairs, *lead, carried, carried)
+    rest : ndarray, shape (pairs, *lead, carried, k)
+    """
+
+    log: np.ndarray
+    after: Mixture
+    shift: np.ndarray
+    link: np.ndarray
+    rest: np.ndarray
+
+
+def turned_back(before: Mixture, place: Place) -> Back:
+    """How a slice leads back to the one before, from the filter's beliefs about that.
+
+    As Kim has it, rows from this one on tell of the mode before through this mode alone.
+    """
+    stretch, pattern = place.stretch, place.pattern
+    pairs, c = stretch.pairs, place.layout.n_prev
+    log = before.log[pairs.src] + stretch.log_of(place.at)
+    total, _ = shares(pairs.by_dst.logs(log))
+    own = total[pairs.dst]
+    log = np.where(own > -np.inf, log - np.where(own > -np.inf, own, 0.0), -np.inf)
+    start = before.first(c)
+    after, _, made, eta = taken(place, False, start.mean[pairs.src], start.factor[pairs.src], True)
+    p, carried = len(pattern.observed), place.layout.carried
+    factor = roots_of(place, made, after.shape[:-1])
+    turn = np.broadcast_to(made.turn, (*after.shape[:-1], *made.turn.shape[-2:]))
+    return Back(
+        log,
+        Mixture(log, after, factor).first(carried),
+        multiplied(turn[..., :p], eta),
+        turn[..., p : p + carried],
+        turn[..., p + carried :],
+    )
+
+
+class Smoothed(NamedTuple):
+    """Modes given later rows: numbers are ``mean + factor @ noise`` of the filter, with noise of moments.
+
+    Attributes
+    ----------
+    log : ndarray, shape (modes, *lead)
+    noise : ndarray, shape (modes, *lead, carried)
+    spread : ndarray, shape (modes, *lead, carried, carried)
+        Root of the noise's covariance.
+    """
+
+    log: np.ndarray
+    noise: np.ndarray
+    spread: np.ndarray
+
+
+def unsmoothed(filtered: Mixture, carried: int) -> Smoothed:
+    """The last slice, of which later rows tell nothing."""
+    shape = filtered.log.shape
+    spread = np.broadcast_to(np.eye(carried), (*shape, carried, carried))
+    return Smoothed(filtered.log, np.zeros((*shape, carried)), spread)
+
+
+def smoothed(back: Back, place: Place, filtered: Mixture, later: Smoothed) -> Smoothed:
+    """The slice before, from beliefs about this one given later rows (``filtered`` without them)."""
+    pairs, c = place.stretch.pairs, later.noise.shape[-1]
+    left = filtered.factor[..., :c, :c]
+    mean = filtered.mean[..., :c] + np.matvec(left, later.noise)
+    root = left @ later.spread
+    dst = pairs.dst
+    off = (mean[dst] - back.after.mean)[..., None]
+    noise, free = _noise_of(back.after.factor, np.concatenate([off, root[dst]], axis=-1))
+    found = back.link @ noise
+    parts = [found[..., 1:], back.rest]
+    if free is not None:
+        parts.append(back.link @ free)
+    log = later.log[dst] + back.log
+    groups = pairs.by_src
+    assert groups is not None
+    members = groups.members
+    whole = merged(
+        groups.logs(log),
+        (back.shift + found[..., 0])[members],
+        np.concatenate(parts, axis=-1)[members],
+    )
+    return Smoothed(*whole)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+#: directions of a root that are shorter than this share of the longest, row by row, are known exactly
+_NOTHING = 1e-10
+
+
+def _ahead(merging: str, before: Mixture | None, place: Place) -> Mixture:
+    """Gaussians to take through a slice, with their weights there; of kinds, or under GPB2 of pairs."""
+    stretch = place.stretch
+    pairs, log = stretch.pairs, stretch.log_of(place.at)
+    if before is None:
+        start = nothing(place.layout)
+        count = len(pairs.dst)
+        return Mixture(
+            np.broadcast_to(log, (count, *log.shape[1:])),
+            np.repeat(start.mean, count, axis=0),
+            np.repeat(start.factor, count, axis=0),
+        )
+    start = before.first(place.layout.n_prev)
+    log = start.log[pairs.src] + log
+    if merging == "gpb2":
+        return Mixture(log, start.mean[pairs.src], start.factor[pairs.src])
+    groups = pairs.by_kind
+    if merging == "imm":
+        at = pairs.src[groups.members]
+        return merged(groups.logs(log), start.mean[at], start.factor[at])
+    one = merged(start.log[None], start.mean[None], start.factor[None])
+    kinds = len(pairs.of_kind)
+    total, _ = shares(groups.logs(log))
+    return Mixture(total, np.repeat(one.mean, kinds, axis=0), np.repeat(one.factor, kinds, axis=0))
+
+
+def _noise_of(factor: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """What noise makes numbers, shape (..., c, k), by a root; and noise that makes none, if there is some.
+
+    Numbers of unlike units count alike.
+    """
+    size = np.sqrt(np.vecdot(factor, factor))
+    size = np.where(size > 0, size, 1.0)[..., None]
+    left, values, right = np.linalg.svd(factor / size)
+    longest = values[..., :1] if values.shape[-1] else values
+    kept = values > _NOTHING * longest
+    scaled = np.matrix_transpose(left) @ (numbers / size)
+    inner = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)[..., None] * scaled
+    turned = np.matrix_transpose(right)
+    free = None if kept.all() else turned * ~kept[..., None, :]
+    return turned @ inner, free

@@ -1,0 +1,336 @@
+"""A series passed forward and back, and rows taken one by one: what leads from data to mixtures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, Row, SeriesProblem, Slices
+from bayesmc.engines.filtering import pass_slices
+from bayesmc.engines.kalman.data import SeriesData, given_values, pattern_of, stacked
+from bayesmc.engines.kalman.levels import Rule
+from bayesmc.engines.kalman.slices import Layout, unknown_nodes
+from bayesmc.engines.switching.merging import Mixture
+from bayesmc.engines.switching.modes import Modes
+from bayesmc.engines.switching.passes import (
+    Back,
+    Place,
+    Smoothed,
+    advanced,
+    smoothed,
+    turned_back,
+    unsmoothed,
+)
+from bayesmc.engines.switching.posterior import Beliefs, SwitchingSeries, answers, by_modes
+from bayesmc.engines.switching.stretches import Stretch
+from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityError
+from bayesmc.network import Observed
+
+
+class Options(NamedTuple):
+    """Of the engine."""
+
+    engine: Any
+    merging: str
+    rule: Rule | None
+    most: int
+
+
+class SwitchingRun:
+    """A series, slice 0 and the later slices as stretches over the modes that it can come to.
+
+    Raises
+    ------
+    UnsupportedError, ParameterError
+    """
+
+    def __init__(
+        self, problem: SeriesProblem, modes: Modes, data: SeriesData, options: Options
+    ) -> None:
+        self.problem, self.modes, self.data, self.options = problem, modes, data, options
+        series = problem.series
+        self.observed = {n: o for n, o in series.observed.items() if n not in data.known}
+        rule = options.rule
+        first = Stretch(
+            data.layouts[0], modes, data.values(0, 1), self._seen(0, 1), 1, None, rule=rule
+        )
+        self.now, self.stretches = first.pairs.now, [first]
+        if data.steps > 1:
+            later = data.values(1, data.steps), self._seen(1, data.steps), data.steps - 1
+            while True:
+                _check_count(len(self.now), options)
+                found = Stretch(data.layouts[1], modes, *later, self.now, rule=rule)
+                more = np.union1d(self.now, found.pairs.now)
+                if len(more) == len(self.now):
+                    break
+                self.now = more
+            self.stretches.append(
+                Stretch(data.layouts[1], modes, *later, self.now, self.now, rule=rule)
+            )
+        _check_count(len(self.now), options)
+
+    def forward(self, advance: Callable[[], None]) -> tuple[list[Mixture], np.ndarray]:
+        """Mixtures over modes of every slice given the rows up to it, and log densities of the rows."""
+        data, merging = self.data, self.options.merging
+        found: list[Mixture] = []
+        increments = np.empty((data.steps, *data.layouts[0].lead))
+        places = self.places()
+
+        def move(k: int) -> None:
+            place = places[k]
+            after, increments[k], made = advanced(merging, found[-1] if found else None, place)
+            check_row(data.series.start + k, increments[k], after)
+            found.append(after if k else self._over_all(after))
+
+        def so_far(k: int) -> SwitchingSeries:
+            return self.answers("filter", found[:k], increments[:k])
+
+        pass_slices(data.series.start, data.steps, move, so_far, advance)
+        return found, increments
+
+    def smoothed(self, filtered: list[Mixture], lag: int | None) -> list[Mixture]:
+        """The same given all rows, or those of so many slices later: Kim's smoother."""
+        carried, steps, places = self.data.layouts[0].carried, self.data.steps, self.places()
+        backs: list[Back | None] = [None] * steps
+        for k in range(1, steps):
+            backs[k] = turned_back(filtered[k - 1], places[k])
+        found: list[Mixture] = [filtered[-1]] * steps
+        ends = [steps - 1] if lag is None else range(steps)
+        for end in ends:
+            here = unsmoothed(filtered[end], carried)
+            stop = 0 if lag is None else max(0, end - lag)
+            if lag is None or end == steps - 1 or not lag:
+                found[end] = filtered[end]
+            for k in range(end, stop, -1):
+                back = backs[k]
+                assert back is not None
+                here = smoothed(back, places[k], filtered[k], here)
+                if lag is None or end == steps - 1 or k - 1 == end - lag:
+                    found[k - 1] = _applied(filtered[k - 1], here)
+        return found
+
+    def places(self) -> list[Place]:
+        """Every slice with its row."""
+        data, found = self.data, []
+        patterns, which = data.patterns
+        rows = [data.seen(low, high) for _, (low, high) in data.spans()]
+        for k in range(data.steps):
+            stretch, at = (self.stretches[0], 0) if not k else (self.stretches[1], k - 1)
+            pattern, row = patterns[which[k]], rows[min(k, 1)][at]
+            given = None if data.given is None else data.given[0][k]
+            found.append(
+                Place(stretch, at, pattern, _with_given(stretch.layout, pattern, row, given), given)
+            )
+        return found
+
+    def answers(
+        self, kind: str, found: list[Mixture], increments: np.ndarray, queries: Any = None
+    ) -> SwitchingSeries:
+        """Of the first so many slices."""
+        steps, data, series = len(found), self.data, self.problem.series
+        model = self.problem.slices.first
+        known = {n: series.observed[n].value[:steps] for n in data.known}
+        known |= {n: o.value for n, o in series.static.items()} | data.computed(steps)
+        known = {n: np.broadcast_to(v, (steps, *model[n].value_shape)) for n, v in known.items()}
+        told = {
+            n: tuple(None if a is None else a[:steps] for a in pair)
+            for n, pair in self.told.items()
+        }
+        weights, mean, factor = (np.stack(a) for a in zip(*found, strict=True))
+        beliefs = Beliefs(
+            data.layouts[0], self.modes, self.now, np.exp(weights), mean, factor, known,
+            values_by_mode(model, told),
+        )  # fmt: skip
+        seen = {
+            n: Observed(o.value[:steps], None if o.mask is None else o.mask[:steps])
+            for n, o in self.observed.items()
+        }
+        return answers(
+            self.options.engine, beliefs, kind, increments, told, seen, series.start, queries
+        )  # fmt: skip
+
+    @cached_property
+    def told(self) -> dict[str, tuple[Any, Any]]:
+        """See ``posterior.by_modes``."""
+        return by_modes(self.stretches, self.now)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _seen(self, low: int, high: int) -> dict[str, Observed]:
+        wanted = {*self.modes.names, *self.modes.leaves}
+        return {
+            n: Observed(o.value[low:high], None if o.mask is None else o.mask[low:high])
+            for n, o in self.observed.items()
+            if n in wanted
+        }
+
+    def _over_all(self, first: Mixture) -> Mixture:
+        """Slice 0 over all modes that there are later; those that it cannot have weigh nothing."""
+        here = np.searchsorted(self.now, self.stretches[0].pairs.now)
+        if len(here) == len(self.now):
+            return first
+        whole = [np.zeros((len(self.now), *a.shape[1:])) for a in first]
+        whole[0][...] = -np.inf
+        for wide, own in zip(whole, first, strict=True):
+            wide[here] = own
+        return Mixture(*whole)
+
+
+class SwitchingState(NamedTuple):
+    """A slice as a belief goes on from it.
+
+    Attributes
+    ----------
+    modes : Modes
+    now : ndarray of int
+    found : Mixture
+    layout : Layout
+    known : dict
+        Values of what is known.
+    told : dict
+        See ``by_modes``.
+    observed : dict
+    """
+
+    modes: Modes
+    now: np.ndarray
+    found: Mixture
+    layout: Layout
+    known: dict[str, np.ndarray]
+    told: dict[str, tuple[Any, Any]]
+    observed: dict[str, Observed]
+
+    def posterior(self, t: int) -> SwitchingSeries:
+        """Answers about this slice."""
+        model = self.layout.slices.first
+        known = {n: np.broadcast_to(v, model[n].value_shape)[None] for n, v in self.known.items()}
+        weights, mean, factor = (a[None] for a in self.found)
+        beliefs = Beliefs(
+            self.layout, self.modes, self.now, np.exp(weights), mean, factor, known,
+            values_by_mode(model, self.told),
+        )  # fmt: skip
+        return answers(None, beliefs, "filter", None, self.told, self.observed, t)
+
+
+def row_taken(
+    slices: Slices,
+    modes: Modes,
+    static: Mapping[str, np.ndarray],
+    row: Row,
+    before: SwitchingState | None,
+    options: Options,
+) -> tuple[SwitchingState, np.ndarray]:
+    """The slice after ``before``, and the log density of its row.
+
+    Raises
+    ------
+    UnsupportedError, ParameterError, DegeneracyError, ZeroProbabilityError
+    """
+    mine = {*modes.names, *modes.leaves}
+    seen = frozenset(n for n, o in row.seen.items() if o.mask is None) - mine
+    carried = () if before is None else before.layout.after
+    unknown = unknown_nodes(slices, before is None, modes.known(seen), carried)
+    layout = Layout(slices, modes.apart, before is None, carried, unknown)
+    values = {**row.inputs, **{n: row.seen[n].value for n in seen}}
+    if before is not None:
+        values |= {n + PREVIOUS: v for n, v in before.known.items()}
+    timed = {n: np.asarray(v)[None] for n, v in values.items()}
+    observed = {
+        n: Observed(o.value[None], None if o.mask is None else o.mask[None])
+        for n, o in row.seen.items()
+        if n in mine
+    }
+    some = np.zeros((), dtype=np.intp)
+    possible = {**static, **values, **modes.at(some)}
+    why = options.engine.refused_slice(modes, layout, possible | modes.at(some, PREVIOUS))
+    if why is not None:
+        raise UnsupportedError(f"{type(options.engine).__name__}: {why}")
+    configurations = None if before is None else before.now
+    stretch = Stretch(
+        layout, modes, {**static, **timed}, observed, 1, configurations, rule=options.rule
+    )
+    _check_count(len(stretch.pairs.now), options)
+    partly = {n: o for n, o in row.seen.items() if n not in seen and n not in mine}
+    found = given_values(layout, partly, ())
+    nothing = np.zeros((*layout.lead, layout.n), dtype=bool)
+    pattern = pattern_of(layout, nothing if found is None else found[1])
+    given = None if found is None else found[0]
+    target = stacked(layout, {n: row.seen[n].value for n in layout.seen}, ())
+    place = Place(stretch, 0, pattern, _with_given(layout, pattern, target, given), given)
+    after, increment, _ = advanced(options.merging, None if before is None else before.found, place)
+    check_row(row.t, increment, after)
+    known = {n: row.seen[n].value for n in seen}
+    plain = (n for n in layout.computed if n not in modes.names and not _of_modes(modes, layout, n))
+    known |= {n: _evaluated(layout, n, {**static, **values}) for n in plain}
+    told = by_modes([stretch], stretch.pairs.now)
+    state = SwitchingState(modes, stretch.pairs.now, after, layout, known, told, observed)
+    return state, increment
+
+
+def check_row(t: int, increment: np.ndarray, found: Mixture) -> None:
+    """Refuse a row that no mode can have.
+
+    Raises
+    ------
+    ZeroProbabilityError, DegeneracyError
+    """
+    if (increment == -np.inf).any():
+        raise ZeroProbabilityError(
+            f"the row of slice {t} has probability zero given those before, whatever the modes; check the row, "
+            "or give what is known without noise (a scale of 0, a probability of 0) a little"
+        )
+    if not (np.isfinite(increment).all() and np.isfinite(found.mean).all()):
+        raise DegeneracyError(f"the row of slice {t} has no density given those before", t)
+
+
+def values_by_mode(model: Any, told: Mapping[str, tuple[Any, Any]]) -> dict[str, np.ndarray]:
+    """Values of computed nodes that modes tell, by slice and mode."""
+    return {
+        n: one.argmax(axis=-1) if two is None else one
+        for n, (one, two) in told.items()
+        if not model[n].is_stochastic
+    }
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _check_count(count: int, options: Options) -> None:
+    if count > options.most:
+        raise UnsupportedError(
+            f"the finite nodes of a slice have {count} joint states that are possible, more than max_modes="
+            f"{options.most}; allow more, or use ParticleFilter"
+        )
+
+
+def _applied(filtered: Mixture, later: Smoothed) -> Mixture:
+    """Numbers whose noise has other moments than the filter's."""
+    c = later.noise.shape[-1]
+    left = filtered.factor[..., :c]
+    mean = filtered.mean + np.matvec(left, later.noise)
+    factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
+    return Mixture(later.log, mean, factor)
+
+
+def _with_given(
+    layout: Layout, pattern: Any, row: np.ndarray, given: np.ndarray | None
+) -> np.ndarray:
+    """Values of the numbers that a pattern observes."""
+    if given is None or len(pattern.observed) == layout.p:
+        return row
+    return np.concatenate([row, given[..., pattern.observed[layout.p :] - layout.p]], axis=-1)
+
+
+def _of_modes(modes: Modes, layout: Layout, name: str) -> bool:
+    return bool(modes.reach(layout, name) or modes.reach(layout, name, PREVIOUS))
+
+
+def _evaluated(layout: Layout, name: str, values: dict[str, np.ndarray]) -> np.ndarray:
+    """A computed node's value; those above it come first."""
+    for parent in layout.model[name].parents:
+        if parent in layout.computed and parent not in values:
+            values[parent] = _evaluated(layout, parent, values)
+    return layout.model.evaluate(name, values)[0]
