@@ -82,7 +82,7 @@ class Block:
         """A node's stored values; None where all particles agree."""
         key = ("rows", node.name)
         if key not in self._kept:
-            values = [p.values[node.name] for p in self.slices]
+            values = [_values(p, node) for p in self.slices]
             apart = set(self.layout.apart) <= set(node.plates)
             if apart and self.whole:
                 shape = (self.particles, *node.value_shape)
@@ -208,6 +208,9 @@ class Block:
         np.subtract(rows, mean[..., None], out=off)
         np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
+        if _is_integrated(self.slices[0], node):
+            inside = [p.inner.variance_of(node) for p in self.slices]
+            variance += self.weighted(self.turned(inside, self._axes(node)))
         if angles is not None:
             variance = np.where(angles, circular_variance(cosine, sine), variance)
             length = np.exp(-0.5 * variance)[..., None]
@@ -276,6 +279,17 @@ def diagnosed(slices: Sequence[Figures], lead: tuple[int, ...]) -> dict[str, np.
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _is_integrated(particles: Particles, node: CompiledNode) -> bool:
+    return particles.inner is not None and node.name in particles.inner.layout.rows
+
+
+def _values(particles: Particles, node: CompiledNode) -> np.ndarray:
+    """What a mean is taken over: of what is integrated out, every particle's own mean."""
+    if _is_integrated(particles, node):
+        return particles.inner.mean_of(node)  # type: ignore[no-any-return]
+    return particles.values[node.name]
 
 
 def _unique(particles: Particles, lead: tuple[int, ...]) -> Any:

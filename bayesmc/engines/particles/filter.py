@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -12,13 +12,13 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
-from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
+from bayesmc.engines.marginal import options as marginal
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
-from bayesmc.engines.particles.optimal import OptimalPlan
+from bayesmc.engines.particles.making import made_step
 from bayesmc.engines.particles.options import (
     BUDGET,
     NOT_SMOOTHED,
@@ -44,14 +44,13 @@ from bayesmc.engines.particles.options import (
 )
 from bayesmc.engines.particles.record import FilteredParticles, filtered_by
 from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
 from bayesmc.engines.particles.smc import quiet
 from bayesmc.engines.particles.smoothing import Backwards, backwards, by_lag
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
+from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
-from bayesmc.resampling import Adaptive, checked, scheme_of
+from bayesmc.resampling import scheme_of
 from bayesmc.results.predictive import warn_of_misfit
 
 #: options that hold functions by node
@@ -108,6 +107,13 @@ class ParticleFilter(FilterEngine):
         is narrow. Particles are then resampled whenever their number changes.
     recovery : Recovery, optional
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
+
+    marginalize : "auto", sequence of str, or None
+        Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
+        given the sampled ones, each particle with a Kalman filter of its own, all in one array operation, and
+        weighted by the density of the row given these. ``"auto"``: all that can be, names: those, None: none.
+        ``explain`` says which, and why not more. With ``proposal="optimal"`` finite sampled nodes are drawn
+        given the row (the mixture Kalman filter). ``particles`` of such nodes are a draw from each filter.
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
@@ -176,6 +182,7 @@ class ParticleFilter(FilterEngine):
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
     adapt: KLD | None = None
     recovery: Recovery | None = None
+    marginalize: Any = None
     tolerance: float = TOLERANCE
     budget: int = BUDGET
 
@@ -199,6 +206,7 @@ class ParticleFilter(FilterEngine):
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
         check_together(self)
+        object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
@@ -233,20 +241,26 @@ class ParticleFilter(FilterEngine):
         if common is not None:
             return common
         asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
-        return refused(self, problem, asked)
+        return refused(self, problem, asked) or marginal.why_not(self, problem, asked)
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
+        if asked.what == "fixed-lag" and marginal.split_of_problem(self, problem):
+            return marginal.NOT_LAGGED
         sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
+        if marginal.split_of_problem(self, problem):
+            return marginal.told(self, problem, found)
         return found | looks_told(self, problem, found)
 
     def effort(self, problem: SeriesProblem) -> str:
-        step = self._sized(START).step_of(problem.slices, problem.known_static)
+        step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
+        if step.integrated:
+            return "a Kalman filter for each particle"
         return told(step, problem, self.resampling == "systematic")
 
     def filter(
@@ -291,6 +305,8 @@ class ParticleFilter(FilterEngine):
             raise UnsupportedError(NOT_SMOOTHED)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
+        if lag is not None and marginal.split_of_problem(self, problem):
+            raise UnsupportedError(marginal.NOT_LAGGED)
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
         else:
@@ -308,31 +324,14 @@ class ParticleFilter(FilterEngine):
         slices: Slices,
         static: Mapping[str, np.ndarray],
         kept: Sequence[str] | None = None,
+        seen: Collection[str] = (),
     ) -> FilterStep:
-        """The step of this filter on a template, whose particles hold some nodes (all by default)."""
+        """The step of this filter on a template, whose particles hold some nodes (all by default).
+
+        ``seen`` are nodes that are seen in full in every slice.
+        """
         self._require_functions()
-        scheme: Any = scheme_of(self.resampling)
-        threshold = float(self.ess_threshold)
-        if isinstance(scheme, Adaptive):
-            scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
-        assert self.particles is not None
-        apart = plates_apart(slices)
-        if isinstance(self.proposal, str):
-            plan: SlicePlan = OptimalPlan(slices, apart, static)
-        else:
-            plan = SlicePlan(slices, apart, static, self._proposals(slices))
-        stage: Any = None
-        if callable(self.auxiliary):
-            stage = GivenStage(plan, self.auxiliary, self.particles)
-        elif self.auxiliary:
-            stage = PluggedIn(plan, self.particles)
-        renewed = None if self.rejuvenation is None else Rejuvenation(plan, self.rejuvenation)
-        injection = None if self.recovery is None else Injection(plan, self.recovery)
-        wanted = kept if kept is None or self.adapt is None else [*kept, *self.adapt.widths]
-        return FilterStep(
-            plan, self.particles, checked(scheme), threshold, stage, renewed, wanted, self.adapt,
-            injection,
-        )  # fmt: skip
+        return made_step(self, slices, static, kept, seen)
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
         return ParticleBelief(dbn, seed_sequence(rng), static)
@@ -348,7 +347,9 @@ class ParticleFilter(FilterEngine):
                 f"ParticleFilter({most}).start: the belief has {held} particles; go on with the "
                 "engine that it was started with"
             )
-        step = sized.step_of(slices, read_static(slices, belief.static))
+        inner = None if belief.now is None else belief.now.inner
+        seen = () if inner is None else inner.seen
+        step = sized.step_of(slices, read_static(slices, belief.static), seen=seen)
         return ParticleBelief(
             dbn, belief.seed, belief.static, step, belief.now,
             belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
@@ -357,7 +358,8 @@ class ParticleFilter(FilterEngine):
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
         step, tracker = belief.made_by, belief.tracker
         if not isinstance(step, FilterStep):
-            step = self._sized(START).step_of(slices, read_static(slices, belief.static))
+            full = [n for n, o in row.seen.items() if o.mask is None]
+            step = self._sized(START).step_of(slices, read_static(slices, belief.static), seen=full)
             warn_of_what_is_not_guided(self, slices, row.seen)
         tracker = Tracker(step) if tracker is None else tracker
         chance = belief.chance
@@ -388,8 +390,9 @@ class ParticleFilter(FilterEngine):
         """All slices, one by one."""
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
-        step = self.step_of(problem.slices, problem.known_static, kept)
-        step = compiled_step(step, problem.steps, self.resampling == "systematic")
+        step = self.step_of(problem.slices, problem.known_static, kept, problem.seen)
+        if not step.integrated:
+            step = compiled_step(step, problem.steps, self.resampling == "systematic")
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _sized(self, particles: int) -> ParticleFilter:

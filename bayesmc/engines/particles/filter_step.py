@@ -51,6 +51,9 @@ class FilterStep(SMCStep):
         Lets a share of the particles begin anew.
     """
 
+    #: nodes that are integrated out, of which particles hold but a draw each
+    integrated: frozenset[str] = frozenset()
+
     def __init__(
         self,
         plan: SlicePlan,
@@ -71,7 +74,7 @@ class FilterStep(SMCStep):
             Layout(particles, plan.apart, lead, block), nodes, slices.interface,
             slices.dynamic if kept is None else kept, resample, threshold,
         )  # fmt: skip
-        self.plan, self.slices = plan, slices
+        self.plan, self.slices, self.is_guided = plan, slices, plan.guided
         self.steps, self.known = plan.steps, plan.known  # type: ignore[method-assign]
         self.first_stage, self.rejuvenate = first_stage, rejuvenate
         self.counts, self.injection = counts, injection
@@ -88,10 +91,10 @@ class FilterStep(SMCStep):
             mixed = self.injection.mixed(row, before, earlier, selection, passed, rng)
             (values, log, selection, injected), averages = mixed, earlier.averages
         found = self.weighted(row, values, log, selection)
-        if not _has_weight(found) and self.rejuvenate is not None:
+        if not has_weight(found) and self.rejuvenate is not None:
             steps = self.rejuvenate(row)
             found = self._renewed(steps, row, before, found, selection, rng)
-        if not _has_weight(found):
+        if not has_weight(found):
             raise self._degenerate(row, before, found.values, selection)
         if self.injection is None:
             return found
@@ -201,9 +204,7 @@ class FilterStep(SMCStep):
         )
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _has_weight(particles: Particles) -> bool:
+def has_weight(particles: Particles) -> bool:
+    """Whether any weight is left, in all elements of the plates apart."""
     total = particles.total
     return bool(total > 0 if isinstance(total, float) else (total > 0).all())

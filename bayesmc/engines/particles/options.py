@@ -267,7 +267,7 @@ def warn_of_what_is_not_guided(engine: Any, slices: Slices, seen: Collection[str
     -----
     ProposalWarning
     """
-    if engine.proposal != "optimal":
+    if engine.proposal != "optimal" or engine.marginalize is not None:
         return
     missing = guidance(slices, seen, plates_apart(slices)).missing()
     if missing is not None:

@@ -1,0 +1,244 @@
+"""The step of a particle filter that integrates out what is linear-Gaussian given what it samples.
+
+Sampled nodes are drawn as in any particle filter. Every particle carries a Gaussian belief about the others;
+the predictive density of what is seen of these weighs it. Beside it stands one draw from that belief, so
+that the particles, completed by these, are draws of all nodes as those of a plain filter are: functions of
+nodes, smoothing and the errors of answers take them as they come.
+
+References
+----------
+Doucet, de Freitas, Murphy and Russell (2000), Rao-Blackwellised particle filtering for dynamic Bayesian
+networks, UAI 16; Chen and Liu (2000), Mixture Kalman filters, JRSS B 62.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.dbn import Row
+from bayesmc.engines.kalman.data import given_values, pattern_of, stacked
+from bayesmc.engines.kalman.slices import Layout, unknown_nodes
+from bayesmc.engines.marginal.choices import Choices
+from bayesmc.engines.marginal.gaussians import Gaussians, nothing, take_in
+from bayesmc.engines.marginal.reading import SliceReader, Values
+from bayesmc.engines.marginal.split import Split
+from bayesmc.engines.particles.filter_step import FilterStep, has_weight
+from bayesmc.engines.particles.smc import Particles, Selection
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals
+from bayesmc.errors import DegeneracyError, UnsupportedError
+from bayesmc.network.forward import Step
+from bayesmc.network.forward import nothing as no_step
+
+
+class MarginalPlan(SlicePlan):
+    """Steps of slices without the nodes whose values no particle has."""
+
+    left_out: frozenset[str] = frozenset()
+
+    def step(self, row: Row, name: str) -> Step:
+        return no_step if name in self.left_out else super().step(row, name)
+
+    def steps_without(self, row: Row, left_out: frozenset[str]) -> list[Step]:
+        """The steps of a row's slice but for some nodes."""
+        self.left_out = left_out
+        return self._build(row)
+
+
+class Place(NamedTuple):
+    """What rows in which the same nodes are seen have in common.
+
+    Attributes
+    ----------
+    layout : Layout
+    reader : SliceReader
+    steps : list of Step, or None
+        None where something is seen in part: they are built for each row.
+    choices : Choices or None
+        Of finite nodes, drawn with a look at the row.
+    """
+
+    layout: Layout
+    reader: SliceReader
+    steps: list[Step] | None
+    choices: Choices | None
+
+
+class MarginalStep(FilterStep):
+    """The step of a Rao-Blackwellised particle filter on a template.
+
+    Parameters
+    ----------
+    plan : SlicePlan
+        Of all nodes, without proposals.
+    split : Split
+    proposals : SliceProposals or None
+        Of sampled nodes; with None finite ones are drawn given the row.
+
+    The others are those of ``FilterStep``.
+    """
+
+    def __init__(
+        self,
+        plan: SlicePlan,
+        split: Split,
+        particles: int,
+        resample: Callable[..., np.ndarray],
+        threshold: float,
+        kept: Sequence[str] | None,
+        proposals: SliceProposals | None,
+    ) -> None:
+        super().__init__(plan, particles, resample, threshold, kept=kept)
+        self.split, self.looks = split, proposals is None
+        self.integrated = frozenset(split.inner)
+        self.sampling = MarginalPlan(plan.slices, plan.apart, plan.static, proposals)
+        self.is_guided = self.looks or self.sampling.guided
+        self._places: dict[Any, Place] = {}
+
+    def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
+        place = self._place(row, None if earlier is None else earlier.inner)
+        before, selection = self.chosen(earlier, row, rng)
+        before = {k: v for k, v in before.items() if k not in place.reader.hidden_before}
+        inner = nothing(place.layout, selection.particles)
+        if earlier is not None:
+            inner = earlier.inner.carried().taken(selection.ancestors)
+        steps = place.steps
+        if steps is None:
+            steps = self.sampling.steps_without(row, _left_out(place.layout))
+        values, log = self.propagated(steps, row, before, selection, rng)
+        values, log, inner = self._taken(place, row, before, values, log, inner, selection, rng)
+        found = self.weighted(row, values, log, selection)
+        if not has_weight(found):
+            raise _degenerate(selection.particles, row)
+        self._complete(values, inner, rng)
+        return found._replace(inner=inner._replace(seen=self.split.seen))
+
+    def stored(self, row: Any, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """All values of the slice that particles have; those that are not kept go later."""
+        return {n: values[n] for n in self.slices.dynamic if n in values}
+
+    def recycle(self, particles: Particles) -> None:
+        """Gaussians look at arrays of theirs for longer."""
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _taken(
+        self,
+        place: Place,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        values: dict[str, np.ndarray],
+        log: Any,
+        inner: Gaussians,
+        selection: Selection,
+        rng: np.random.Generator,
+    ) -> tuple[dict[str, np.ndarray], Any, Gaussians]:
+        """The row taken in by the Gaussians: all values that particles have, log weights, beliefs."""
+        layout = place.layout
+        known = self._values(place, row, before, values, selection)
+        partly = {n: o for n, o in row.seen.items() if o.mask is not None}
+        found = given_values(layout, partly, ())
+        empty = np.zeros((*layout.lead, layout.n), dtype=bool)
+        pattern = pattern_of(layout, empty if found is None else found[1])
+        given = None if found is None else found[0]
+        target = stacked(layout, {n: row.seen[n].value for n in layout.seen}, ())
+        if given is not None and len(pattern.observed) > layout.p:
+            more = given[..., pattern.observed[layout.p :] - layout.p]
+            target = np.concatenate([target, more], axis=-1)
+        if place.choices is None:
+            made = take_in(layout, pattern, inner, place.reader.read(known), target, given)
+            return values, log + made.log[:, 0], made.chosen(None)
+        prior, coefficients = place.choices.read(known, row, place.reader)
+        made = take_in(layout, pattern, inner, coefficients, target, given)
+        own, at = place.choices.drawn(prior + made.log, rng)
+        values |= place.choices.values_at(at)
+        for name in layout.computed:
+            values[name] = layout.model.evaluate(name, {**known.at(None), **values})[0]
+        return values, log + own, made.chosen(at)
+
+    def _values(
+        self,
+        place: Place,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        values: Mapping[str, np.ndarray],
+        selection: Selection,
+    ) -> Values:
+        """What is known given what was sampled."""
+        plain, own = dict(self.sampling.known(row)), dict[str, np.ndarray]()
+        taken = {
+            k: self.taken(k, v, selection.ancestors)
+            for k, v in before.items()
+            if k in place.reader.needed
+        }
+        for name, value in {**taken, **values}.items():
+            into = own if value.ndim == self.ranks[name] else plain
+            into[name] = value
+        return Values(plain, own, selection.particles)
+
+    def _complete(
+        self, values: dict[str, np.ndarray], inner: Gaussians, rng: np.random.Generator
+    ) -> None:
+        """Put in draws of what is integrated out, and forget what is not kept."""
+        layout = inner.layout
+        drawn = inner.drawn(rng) if layout.n else None
+        for name, place in layout.rows.items():
+            assert drawn is not None
+            draws = layout.unpacked(layout.model[name], drawn[..., place])
+            draws.flags.writeable = False
+            values[name] = draws
+        for name in [n for n in values if n not in self.kept]:
+            del values[name]
+
+    def _place(self, row: Row, inner: Gaussians | None) -> Place:
+        """The layout of a row's slice.
+
+        Raises
+        ------
+        UnsupportedError
+            A node is missing that everything rests on being seen.
+        """
+        carried = () if inner is None else inner.layout.after
+        partly = any(seen.mask is not None for seen in row.seen.values())
+        full = frozenset(n for n, o in row.seen.items() if o.mask is None)
+        key = (row.t == 0, carried, partly, full)
+        if key not in self._places:
+            late = (self.split.seen - full) & self.split.below
+            known = full | (frozenset(self.slices.stochastic) - self.integrated - late)
+            unknown = unknown_nodes(self.slices, row.t == 0, known, carried)
+            layout = Layout(self.slices, self.layout.apart, row.t == 0, carried, unknown)
+            guarded = [n for n in layout.seen if n not in full]
+            if guarded:
+                raise UnsupportedError(
+                    f"ParticleFilter(marginalize=...): {sorted(late)[0]!r} is missing in slice {row.t}, and "
+                    f"{guarded[0]!r}, which is sampled, depends on it; start with a row that lacks it, or "
+                    "give marginalize=None"
+                )
+            choices = Choices(layout, full, self.sampling) if self.looks else None
+            if choices is not None and not choices.names:
+                choices = None
+            steps: list[Step] | None = [] if choices is not None else None
+            if choices is None and not partly:
+                steps = self.sampling.steps_without(row, _left_out(layout))
+            self._places[key] = Place(layout, SliceReader(layout), steps, choices)
+        return self._places[key]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _left_out(layout: Layout) -> frozenset[str]:
+    """Nodes of a slice that no particle has a value of, and those whose density weighs Gaussians."""
+    return layout.unknown | layout.seen.keys()
+
+
+def _degenerate(particles: int, row: Row) -> DegeneracyError:
+    return DegeneracyError(
+        f"none of {particles} particles explains what was seen in slice {row.t}: every weight is zero; use "
+        'more particles, proposal="optimal", a proposal= that looks at the observations, or less narrow '
+        "noise",
+        row.t,
+        None,
+    )
