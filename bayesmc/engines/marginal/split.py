@@ -87,12 +87,13 @@ class _Search:
         self.hidden = [n for n in slices.stochastic if n not in seen]
         self.models = (slices.first, slices.later)
         self._computed = set(slices.dynamic) - set(slices.stochastic)
-        kept = {**static}
-        free = {n for n in slices.dynamic if n not in seen}
-        free |= {n + PREVIOUS for n in free}
-        for model in self.models:  # what is sampled has another value for every particle
-            kept |= {n: v for n, v in model.probe.items() if n not in free and n not in kept}
-        self.values = kept
+        dynamic = {*slices.dynamic, *(n + PREVIOUS for n in slices.dynamic)}
+        # a batch, as what is sampled has another value for every particle
+        self.values = {
+            n: np.stack([v, v]) if n in dynamic else v
+            for model in self.models
+            for n, v in model.probe.items()
+        } | dict(static)
         self.why: dict[str, str] = {}
 
     def found(self) -> Split:
@@ -244,4 +245,6 @@ class _Search:
             return "is computed from hidden numbers and takes no continuous values"
         if name not in layout.placed:
             return None
-        return why_not_placed(layout, name, self.values)
+        hidden = layout.unknown | {n + PREVIOUS for n in layout.before}
+        values = {n: v for n, v in self.values.items() if n not in hidden}
+        return why_not_placed(layout, name, values)
