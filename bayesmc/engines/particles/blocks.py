@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.engines.marginal.mixtures import is_integrated
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import circular_variance
@@ -208,7 +209,7 @@ class Block:
         np.subtract(rows, mean[..., None], out=off)
         np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
-        if _is_integrated(self.slices[0], node):
+        if is_integrated(self.slices[0].inner, node.name):
             inside = [p.inner.variance_of(node) for p in self.slices]
             variance += self.weighted(self.turned(inside, self._axes(node)))
         if angles is not None:
@@ -281,13 +282,9 @@ def diagnosed(slices: Sequence[Figures], lead: tuple[int, ...]) -> dict[str, np.
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _is_integrated(particles: Particles, node: CompiledNode) -> bool:
-    return particles.inner is not None and node.name in particles.inner.layout.rows
-
-
 def _values(particles: Particles, node: CompiledNode) -> np.ndarray:
     """What a mean is taken over: of what is integrated out, every particle's own mean."""
-    if _is_integrated(particles, node):
+    if is_integrated(particles.inner, node.name):
         return particles.inner.mean_of(node)  # type: ignore[no-any-return]
     return particles.values[node.name]
 

@@ -73,14 +73,14 @@ class Tracker:
         finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
         self.scouting = Scouting(step.slices, step.plan) if finite else None
         blind = step.is_guided or step.first_stage is not None or step.injection is not None
-        self.integrates = bool(step.integrated)
         sampled = [n for n in nodes if n.name not in step.integrated]
         compass = Compass(sampled, step.layout)
         self.compass = compass if compass.nodes and not blind else None
         # after a first stage, what a family should have is not what its weight says
         schemes = (stratified, systematic, ssp)
         self.steady = step.scheme in schemes or step.first_stage is not None
-        self._is_plain = self.steady and not step.layout.apart and self.scouting is None
+        plain = self.scouting is None and not step.integrated
+        self._is_plain = self.steady and not step.layout.apart and plain
 
     def after(
         self,
@@ -115,7 +115,7 @@ class Tracker:
     def summing(self, nodes: Sequence[CompiledNode]) -> Summing | None:
         """What takes the sums of slices with these nodes, where these say all; else None."""
         every = {n.name: n for n in (*nodes, *self.sight.nodes)}.values()
-        if self.layout.particles < MANY or not self._is_plain or self.integrates:
+        if self.layout.particles < MANY or not self._is_plain:
             return None
         if any(n.domain is not None or n.angles is not None for n in every):
             return None
