@@ -15,6 +15,7 @@ from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.marginal.options import split_of_problem
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
@@ -285,7 +286,7 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
     displaced: FilterEngine | None = None
     plain = Asked(asked.what)
     for candidate in _CANDIDATES:
-        engine, name = candidate(), candidate.__name__
+        engine, name = _made(candidate, problem, asked), candidate.__name__
         reason = engine.refusal(problem)
         if reason is None:
             reason = engine.unable(problem, asked)
@@ -311,6 +312,15 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
         raise UnsupportedError(f"{asked.what}: {alike}")
     whys = ". ".join(w if w.startswith(n) else f"{n}: {w}" for n, w in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
+
+
+def _made(candidate: type[FilterEngine], problem: SeriesProblem, asked: Asked) -> FilterEngine:
+    """A candidate; particles integrate out what they can, where they answer what is asked then."""
+    if candidate is ParticleFilter and common_refusal(ParticleFilter(), problem) is None:
+        engine = ParticleFilter(marginalize="auto")
+        if split_of_problem(engine, problem) and _why_not(engine, problem, asked) is None:
+            return engine
+    return candidate()
 
 
 def _instead(

@@ -115,6 +115,15 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     return None
 
 
+def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
+    """Why this engine is taken, where something is integrated out."""
+    split = split_of_problem(engine, problem)
+    if split is None:
+        return ()
+    inner = ", ".join(map(repr, split.inner))
+    return (f"every other hidden node can be sampled, and given these {inner} can be integrated out",)
+
+
 def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
     """What is done to each node, given what plain particles do to it."""
     split = split_of_problem(engine, problem)

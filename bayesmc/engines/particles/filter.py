@@ -241,7 +241,7 @@ class ParticleFilter(FilterEngine):
         if common is not None:
             return common
         asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
-        return refused(self, problem, asked) or marginal.why_not(self, problem, asked)
+        return marginal.why_not(self, problem, asked) or refused(self, problem, asked)
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
@@ -250,6 +250,9 @@ class ParticleFilter(FilterEngine):
             return marginal.NOT_LAGGED
         sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
+
+    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        return marginal.reasons(self, problem)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)

@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import Queries
+from bayesmc.engines.marginal.options import split_of_problem
 from bayesmc.engines.particles.auxiliary import PluggedIn
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.optimal import guidance
@@ -189,10 +190,13 @@ def refused(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     if asked is not None:
         seen = problem.series.observed
         asked.check(seen.keys(), problem.seen)
+    split = split_of_problem(engine, problem)
+    filtered = () if split is None else (*split.below, *split.inner)
+    weighed = [n for n in whole(problem.series.observed) if n not in filtered]
     for model in (problem.slices.first, problem.slices.later):
         inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
         reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
-            model, whole(problem.series.observed), "ParticleFilter"
+            model, weighed, "ParticleFilter"
         )
         if reason is not None:
             return reason

@@ -71,7 +71,7 @@ class Tracker:
         nodes = [step.slices.later[n] for n in step.slices.interface]
         self.sight = Sight(nodes, step.layout)
         finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
-        self.scouting = Scouting(step.slices, step.plan) if finite else None
+        self.scouting = Scouting(step.slices, step.plan) if finite and not step.integrated else None
         blind = step.is_guided or step.first_stage is not None or step.injection is not None
         sampled = [n for n in nodes if n.name not in step.integrated]
         compass = Compass(sampled, step.layout)
