@@ -11,6 +11,7 @@ from benchmarks import (
     bench_robot_logs,
     bench_robots,
     bench_scale,
+    bench_switching,
     bench_time,
     bench_weighting,
 )
@@ -31,6 +32,8 @@ if __name__ == "__main__":
     bench_gibbs.main(sys.argv[1:])
     print()
     bench_time.main(sys.argv[1:])
+    print()
+    bench_switching.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()

@@ -34,6 +34,7 @@ from examples import (
     rejection_and_importance,
     sonar_localization,
     stochastic_volatility,
+    switching_target,
     three_views,
     van_der_merwe,
     weight_collapse,
@@ -45,7 +46,7 @@ FIGURES = (
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
     banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only,
+    landmark_localization, range_only, switching_target,
 )  # fmt: skip
 
 

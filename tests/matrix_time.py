@@ -26,11 +26,13 @@ from bayesmc.errors import (
 from bayesmc.results.series import SeriesPosterior
 from bayesmc.testing import exact, random_dbn, session
 from bayesmc.testing.makers.linear_dbns import random_linear_dbn
+from bayesmc.testing.makers.switching_dbns import random_switching_dbn
 from tests.matrix import DOUBTS, SHIFT
 
 #: "static": a static node is unknown, which particle chains alone answer; "one number": linear ones of which
-#: the default grid finds its range and cells
-KINDS = ("finite", "linear", "static", "one number")
+#: the default grid finds its range and cells; "switching": linear ones with modes that make no difference to
+#: numbers, so that filters that merge Gaussians are exact
+KINDS = ("finite", "linear", "static", "one number", "switching")
 #: templates of each kind for engines that compute, and for those with particles, which take longer
 MANY, FEW = session.scaled(5, 8), session.scaled(2, 15)
 GRID = bmc.GridFilter()
@@ -55,6 +57,8 @@ def series(kind: str, seed: int) -> Series | None:
     """None where it is too large to be answered exactly."""
     if kind == "finite":
         case: Any = random_dbn(seed, nodes=(1, 3), steps=(2, 4))
+    elif kind == "switching":
+        case = random_switching_dbn(seed, difference=0.0)
     else:
         case = random_linear_dbn(seed, vague=2.0)
     data = dict(case.observations)
@@ -88,6 +92,14 @@ COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
     "KalmanFilter": (bmc.KalmanFilter(), 1e-7, ("linear",)),
     "ExtendedKalmanFilter": (bmc.ExtendedKalmanFilter(), 1e-6, ("linear",)),
     "UnscentedKalmanFilter": (bmc.UnscentedKalmanFilter(), 1e-6, ("linear",)),
+    "SwitchingKalmanFilter": (bmc.SwitchingKalmanFilter(), 1e-7, ("linear", "switching")),
+    "SwitchingKalmanFilter, IMM": (bmc.SwitchingKalmanFilter("imm"), 1e-7, ("switching",)),
+    "SwitchingKalmanFilter, GPB1": (bmc.SwitchingKalmanFilter("gpb1"), 1e-7, ("switching",)),
+    "SwitchingKalmanFilter, made linear": (
+        bmc.SwitchingKalmanFilter(linearize=True),
+        1e-6,
+        ("switching",),
+    ),
     "no engine named": (None, 1e-7, ("finite", "linear")),
 }
 

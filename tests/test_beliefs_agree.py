@@ -22,6 +22,7 @@ ONLINE: dict[str, tuple[Any, tuple[str, ...]]] = {
     "KalmanFilter": (bmc.KalmanFilter(), ("linear",)),
     "ExtendedKalmanFilter": (bmc.ExtendedKalmanFilter(), ("linear",)),
     "UnscentedKalmanFilter": (bmc.UnscentedKalmanFilter(), ("linear",)),
+    "SwitchingKalmanFilter": (bmc.SwitchingKalmanFilter(), ("linear", "switching")),
     "bootstrap": (bmc.ParticleFilter(100), ("finite", "linear")),
     "auxiliary": (bmc.ParticleFilter(100, auxiliary=True), ("finite", "linear")),
     "optimal": (bmc.ParticleFilter(100, proposal="optimal"), ("finite", "linear")),

@@ -92,6 +92,37 @@ def condition(rows: np.ndarray, observed: int, carried: int | None = None) -> Co
     return Conditioned(lower[..., :p, :p], lower[..., p:, :p], lower[..., p:, p:], turn, certain)
 
 
+def condition_many(rows: np.ndarray, observed: int) -> Conditioned:
+    """``condition`` for many small matrices, without ``turn``: by Cholesky factors where that loses nothing.
+
+    Covariances are formed there, so a pivot has lost as many digits as its square is smaller than the
+    variance of its row. Where that is more than a few, all are made triangular from the rows themselves.
+
+    Parameters
+    ----------
+    rows : ndarray, shape (..., r, k)
+    observed : int
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.linalg.square_root import condition_many
+    >>> found = condition_many(np.array([[[3.0, 4.0], [3.0, 0.0]]]), 1)
+    >>> found.root.tolist(), found.factor.round(6).tolist()
+    ([[[5.0]]], [[[2.4]]])
+    """
+    p = observed
+    covariance = rows @ rows.swapaxes(-1, -2)
+    try:
+        lower = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return condition(rows, p)
+    pivots = lower.diagonal(0, -2, -1)
+    if not (pivots * pivots > _CLEAR * covariance.diagonal(0, -2, -1)).all():
+        return condition(rows, p)
+    return Conditioned(lower[..., :p, :p], lower[..., p:, :p], lower[..., p:, p:])
+
+
 def standardised(root: np.ndarray, innovation: np.ndarray) -> np.ndarray:
     """Innovations as independent standard normals, shape (..., p)."""
     p = innovation.shape[-1]
@@ -183,6 +214,8 @@ def turned(turn: np.ndarray, observed: int, carried: int) -> Turned:
 
 #: what rounding leaves of a row that is a combination of those before it, relative to its size
 _ROUNDING = 16 * float(np.finfo(float).eps)
+#: share of a variance that is left of it by what stands before, with which its root keeps twelve digits
+_CLEAR = 1e-3
 #: pivots so small beside the largest entry are worth a look
 _SUSPECT = 1e-11
 

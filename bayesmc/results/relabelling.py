@@ -20,6 +20,8 @@ from bayesmc.network import CompiledNode, Model, Problem
 
 #: vectors that may or may not belong to the components, each way of which is tried
 _VECTORS = 6
+#: nodes of a plate of which some alone may be exchangeable, at most
+_NODES = 4
 _CLOSE = 1e-7
 
 
@@ -167,7 +169,11 @@ def _candidates(problem: Problem) -> Iterator[Symmetry]:
             if plate in c.plates
         }
         if own and size > 1:
-            yield from _with_others(hidden, plate, size, own)
+            # all of them, or some: what is sorted before anybody reads it is exchanged alone
+            fewest = 1 if len(own) <= _NODES else len(own)
+            for many in range(len(own), fewest - 1, -1):
+                for some in itertools.combinations(own, many):
+                    yield from _with_others(hidden, plate, size, {n: own[n] for n in some})
     for size in sorted({c.event_shape[-1] for c in hidden.values() if c.event_shape}):
         if size > 1:
             yield from _with_others(hidden, None, size, {})

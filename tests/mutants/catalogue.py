@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.mutants import chains, densities, draws, exact, filters, hamiltonian
+from tests.mutants import chains, densities, draws, exact, filters, hamiltonian, switching
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -10,6 +10,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *draws.MUTANTS,
     *exact.MUTANTS,
     *filters.MUTANTS,
+    *switching.MUTANTS,
     *hamiltonian.MUTANTS,
     *densities.MUTANTS,
 )

@@ -84,6 +84,22 @@ def test_labels_that_switch_are_no_alarm(chains: int) -> None:
     assert pickle.loads(pickle.dumps(posterior)).label_switching == posterior.label_switching
 
 
+def test_what_is_sorted_before_it_is_read_is_exchanged_alone() -> None:
+    """Means in order have names, and so have the scales beside them; what they were sorted from has none."""
+    net = bmc.BayesNet(plates={"cluster": 2, "point": 60})
+    net.add("free", bmc.Normal(0.0, 10.0), plates="cluster")
+    net.add("scale", bmc.HalfNormal(2.0), plates="cluster")
+    net.add("mean", lambda free: np.sort(free.array, axis=-1))
+    net.add(
+        "x",
+        lambda mean, scale: bmc.Mixture([0.5, 0.5], bmc.Normal(mean, scale.array)),
+        plates="point",
+    )
+    values = {"free": np.array([[3.0, -3.0]]), "scale": np.array([[0.7, 0.9]]), "x": DATA[None]}
+    (found,) = symmetries(pose(net, {"x": DATA}), values)
+    assert (found.plate, tuple(found.axes)) == ("cluster", ("free",))
+
+
 def test_components_without_a_plate() -> None:
     posterior, warned = asked(vectors(), {"x": DATA}, bmc.Gibbs(300, 150, 6))
     named = posterior.relabelled("mean")

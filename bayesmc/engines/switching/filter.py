@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.switching.modes import Modes
 from bayesmc.engines.switching.posterior import SwitchingSeries
 from bayesmc.engines.switching.run import Options, SwitchingRun, SwitchingState, row_taken
-from bayesmc.engines.switching.stretches import Stretch
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network.node import nodes_read
 from bayesmc.progress import Progress
@@ -50,7 +49,7 @@ class SwitchingBelief(SliceBelief):
     >>> engine = SwitchingKalmanFilter()
     >>> belief = engine.step(engine.step(engine.start(dbn), {"y": 0.1}), {"y": 2.0})
     >>> belief.t, belief.probabilities("s").round(3).tolist()
-    (1, [0.375, 0.625])
+    (1, [0.315, 0.685])
     """
 
     def cov(self, *names: str) -> np.ndarray:
@@ -99,12 +98,12 @@ class SwitchingKalmanFilter(FilterEngine):
 
     Notes
     -----
-    ``smooth`` is Kim's smoother, on the filter's Gaussians whatever rule made them: given the mode of the next
-    slice, later rows are taken to tell no more of this one's. Gaussians are carried as triangular roots of
-    their covariances, and merged as such; no covariance is subtracted or inverted. All pairs of modes are one
-    array operation, with ``linearize`` one after the other. Plates whose elements never meet have a mode for
-    each element. Finite nodes that nothing reads are averaged over where they are missing, and so are other
-    families that depend on modes alone.
+    ``smooth`` is Kim's smoother, on the filter's Gaussians whatever rule made them: given the mode of the
+    next slice, later rows are taken to tell no more of this one's. Gaussians are carried as triangular
+    roots of their covariances, and merged as such; no covariance is subtracted or inverted. All pairs of
+    modes are one array operation, with ``linearize`` one after the other. Plates whose elements never
+    meet have a mode for each element. Finite nodes that nothing reads are averaged over where they are
+    missing, and so are other families that depend on modes alone.
 
     References
     ----------
@@ -126,9 +125,9 @@ class SwitchingKalmanFilter(FilterEngine):
     >>> rows = {"y": [0.1, -0.2, 0.1, 6.2, 5.9]}
     >>> smoothed = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter())
     >>> smoothed.probabilities("s")[:, 1].round(2).tolist()
-    [0.05, 0.01, 0.03, 1.0, 0.03]
+    [0.06, 0.02, 0.07, 1.0, 0.13]
     >>> smoothed.mean("x").round(1).tolist()
-    [0.0, -0.0, 0.0, 6.0, 6.0]
+    [0.0, 0.0, 0.0, 6.0, 6.0]
     """
 
     merging: Literal["gpb1", "imm", "gpb2"] = "gpb2"
@@ -172,7 +171,7 @@ class SwitchingKalmanFilter(FilterEngine):
         for query, function in asked.queries.items():
             for name in nodes_read(function) if reason is None else ():
                 if name in silent:
-                    return f"queries={{{query!r}: ...}} reads {name!r}, and its functions are not answered for"
+                    return f"queries={{{query!r}: ...}} reads {name!r}, of which no function is answered"
         return reason
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
@@ -222,15 +221,15 @@ class SwitchingKalmanFilter(FilterEngine):
     ) -> SwitchingSeries:
         if keep is not None:
             raise UnsupportedError(
-                f"keep={keep!r}: SwitchingKalmanFilter has no particles; ask its result for mean, var and cov, "
-                "or use a ParticleFilter"
+                f"keep={keep!r}: SwitchingKalmanFilter has no particles; ask its result for mean, var and "
+                "cov, or use a ParticleFilter"
             )
         run = self._run(problem)
         try:
             with Progress(problem.steps, self.label, progress) as bar, quiet():
                 found, increments = run.forward(partial(bar.advance, 1))
         except KeyboardInterrupt as stop:
-            return answer_so_far(stop, self)  # type: ignore[no-any-return]
+            return answer_so_far(stop, self)
         return run.answers("filter", found, increments, queries)
 
     def smooth(
@@ -269,8 +268,8 @@ class SwitchingKalmanFilter(FilterEngine):
         if guarded:
             reads = ", ".join(map(repr, layout.model[guarded[0]].parents))
             return (
-                f"the finite node {guarded[0]!r} depends on continuous nodes that are hidden (it reads {reads}), "
-                "and modes must not; use ParticleFilter"
+                f"the finite node {guarded[0]!r} depends on continuous nodes that are hidden (it reads "
+                f"{reads}), and modes must not; use ParticleFilter"
             )
         if self.linearize:
             return f"{why}; use ParticleFilter"

@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesmc.categorical import log_sum_exp
-from bayesmc.linalg.square_root import condition
+from bayesmc.linalg.square_root import condition_many
 
 
 class Mixture(NamedTuple):
@@ -45,18 +44,24 @@ def shares(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     --------
     >>> import numpy as np
     >>> from bayesmc.engines.switching.merging import shares
-    >>> total, share = shares(np.log([[0.1, 0.3], [0.0, 0.0]]))
+    >>> total, share = shares(np.array([[np.log(0.1), np.log(0.3)], [-np.inf, -np.inf]]))
     >>> np.exp(total).round(6).tolist(), share.round(6).tolist()
     ([0.4, 0.0], [[0.25, 0.75], [1.0, 0.0]])
     """
-    total = log_sum_exp(np.moveaxis(log, 1, 0), axis=0)
-    with np.errstate(invalid="ignore"):
-        share = np.exp(log - total[:, None])
-    none = total == -np.inf
-    if none.any():
-        share = np.where(none[:, None], 0.0, share)
-        share[:, 0] = np.where(none, 1.0, share[:, 0])
-    return total, share
+    top = np.maximum.reduce(log, axis=1)
+    none = None
+    if np.minimum.reduce(top, axis=None) == -np.inf:
+        none = top == -np.inf
+        top = np.where(none, 0.0, top)
+    parts = np.exp(log - top[:, None])
+    total = np.add.reduce(parts, axis=1)
+    if none is None:
+        return np.log(total) + top, parts / total[:, None]
+    parts[:, 0] += none
+    with np.errstate(divide="ignore"):
+        return np.where(none, -np.inf, np.log(total) + top), parts / np.where(none, 1.0, total)[
+            :, None
+        ]
 
 
 def merged(log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> Mixture:
@@ -78,14 +83,15 @@ def merged(log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> Mixture:
     >>> found.mean.tolist(), (found.factor**2).round(6).tolist()  # 2^2 within, 1 between
     ([[0.0]], [[[5.0]]])
     """
+    n, m, size, ndim = mean.shape[-1], factor.shape[-1], log.shape[1], mean.ndim
+    if size == 1 and m == n:
+        return Mixture(log[:, 0], mean[:, 0], factor[:, 0])
     total, share = shares(log)
-    if log.shape[1] == 1 and factor.shape[-1] == factor.shape[-2]:
-        return Mixture(total, mean[:, 0], factor[:, 0])
-    centre = (share[..., None] * mean).sum(axis=1)
-    n, m, size = mean.shape[-1], factor.shape[-1], log.shape[1]
-    root = np.sqrt(share)
+    centre = np.add.reduce(share[..., None] * mean, axis=1)
+    root = np.sqrt(share)[..., None]
     columns = np.empty((*centre.shape, size, m + 1))
-    columns[..., :m] = np.moveaxis(root[..., None, None] * factor, 1, -2)
-    columns[..., m] = np.moveaxis(root[..., None] * (mean - centre[:, None]), 1, -1)
-    found = condition(columns.reshape(*centre.shape, size * (m + 1)), 0)
+    behind = (0, *range(2, ndim), 1)  # members stand beside each other
+    columns[..., :m] = (root[..., None] * factor).transpose(*behind, ndim)
+    columns[..., m] = (root * (mean - centre[:, None])).transpose(behind)
+    found = condition_many(columns.reshape(*centre.shape, size * (m + 1)), 0)
     return Mixture(total, centre, found.factor[..., :n])

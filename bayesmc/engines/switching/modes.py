@@ -60,6 +60,7 @@ class Modes:
         finite = {n for n in slices.stochastic if slices.first[n].domain is not None}
         loose = _loose(slices, seen)
         bent = always_unknown(slices, seen | finite | loose)
+        loose = {n for n in loose if not _reads(slices, n, bent)}
         read = variables_of(slices, seen, True) - bent
         names = [n for n in slices.dynamic if n in read]
         for name in slices.dynamic:  # what needs the mode before to be answered for is part of it
@@ -75,7 +76,7 @@ class Modes:
         hidden = (finite - seen - set(names)) | loose
         self.leaves = tuple(n for n in slices.dynamic if n in hidden)
         nodes = [slices.first[n] for n in self.names]
-        count = math.prod(float(n.domain.size) ** self._elements(n) for n in nodes)  # type: ignore[union-attr]
+        count = math.prod(float(_size(n)) ** self._elements(n) for n in nodes)
         if count > _MOST:
             raise UnsupportedError(
                 f"the finite nodes {', '.join(map(repr, self.names))} of a slice have {count:.4g} joint "
@@ -105,11 +106,9 @@ class Modes:
         if not self.names:
             return None
         for name in layout.computed:
-            if (
-                name in layout.slices.interface
-                and name not in self.names
-                and self.reach(layout, name)
-            ):
+            if name not in layout.slices.interface or name in self.names:
+                continue
+            if self.reach(layout, name) or self.reach(layout, name, PREVIOUS):
                 return (
                     f"node {name!r} is computed from finite nodes and read by the next slice, which should "
                     "read those nodes themselves"
@@ -129,9 +128,9 @@ class Modes:
                 if stem in self.names:
                     if (parent != stem) == bool(ending):
                         found.add(stem)
-                elif parent in layout.computed and parent not in met:
+                elif parent in layout.order and parent not in met:
                     met.add(parent)
-                    todo.append(parent)
+                    todo += [] if layout.model[parent].is_stochastic else [parent]
         return frozenset(found)
 
     def classes(self, layout: Layout) -> np.ndarray:
@@ -163,6 +162,16 @@ def _loose(slices: Slices, seen: frozenset[str]) -> set[str]:
         if not _is_gaussian(slices.later, name):
             found.add(name)
     return found
+
+
+def _reads(slices: Slices, name: str, others: frozenset[str]) -> bool:
+    """Whether a node depends on some others, of its slice or the one before."""
+    parents = (*slices.first[name].parents, *slices.later[name].parents)
+    return any(p.removesuffix(PREVIOUS) in others for p in parents)
+
+
+def _size(node: Any) -> int:
+    return node.domain.size
 
 
 def _is_gaussian(model: Any, name: str) -> bool:

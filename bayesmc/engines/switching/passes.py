@@ -7,18 +7,17 @@ that the next mode gives them; GPB1 carries one Gaussian, merged over all modes.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from bayesmc.categorical import log_sum_exp
 from bayesmc.engines.kalman.covariances import full_factor
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.means import absorbed
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.switching.merging import Mixture, merged, shares
 from bayesmc.engines.switching.stretches import Stretch
-from bayesmc.linalg.square_root import Conditioned, condition, multiplied
+from bayesmc.linalg.square_root import Conditioned, condition, condition_many, log_densities
 
 
 class Place(NamedTuple):
@@ -32,7 +31,9 @@ class Place(NamedTuple):
     pattern : Pattern
     row : ndarray, shape (*lead, observed)
     given : ndarray, shape (*lead, n), or None
-        Values of unknown numbers that are observed.
+        Values of unknown numbers that are observed; of several slices time is first.
+    is_carried : bool
+        Whether the next slice reads some of those.
     """
 
     stretch: Stretch
@@ -40,6 +41,7 @@ class Place(NamedTuple):
     pattern: Pattern
     row: np.ndarray
     given: np.ndarray | None
+    is_carried: bool
 
     @property
     def layout(self) -> Layout:
@@ -52,9 +54,7 @@ def nothing(layout: Layout) -> Mixture:
     return Mixture(np.zeros((1, *lead)), np.zeros((1, *lead, 0)), np.zeros((1, *lead, 0, 0)))
 
 
-def advanced(
-    merging: str, before: Mixture | None, place: Place
-) -> tuple[Mixture, np.ndarray, Conditioned]:
+def advanced(merging: str, before: Mixture | None, place: Place) -> tuple[Mixture, np.ndarray]:
     """The modes of a slice given its row and those before, and the log density of the row.
 
     Parameters
@@ -67,46 +67,84 @@ def advanced(
     Returns
     -------
     Mixture
-        Weights sum to one over the modes.
+        Weights sum to one over the modes. Of the numbers that are worked out, those that the next slice reads
+        first (``whole`` has all of them); where some of those are observed, of all.
     ndarray, shape (*lead,)
-    Conditioned
+        Not finite where no mode can have the row.
     """
-    stretch = place.stretch
-    pairs = stretch.pairs
+    pairs = place.stretch.pairs
     by_kind = merging != "gpb2" or len(pairs.of_kind) == len(pairs.dst)
     ahead = _ahead(merging, before, place)
-    after, log, made = taken(place, by_kind, ahead.mean, ahead.factor)
-    joint = ahead.log + log
-    increment = log_sum_exp(joint, axis=0)
-    factor = roots_of(place, made, after.shape[:-1])
+    taken = _taken(place, by_kind, ahead.mean, ahead.factor)
     by_dst = pairs.kinds_by_dst if by_kind else pairs.by_dst
-    log = joint - np.where(increment > -np.inf, increment, 0.0)
+    log = by_dst.logs(ahead.log + taken.log)
     if by_dst.are_single:
-        return Mixture(log, after, factor), increment, made
-    members = by_dst.members
-    return merged(by_dst.logs(log), after[members], factor[members]), increment, made
+        found = Mixture(log[:, 0], taken.mean, taken.factor)
+    else:
+        found = merged(log, by_dst.of(taken.mean), by_dst.of(taken.factor))
+    top = np.maximum.reduce(found.log, axis=0)
+    if np.minimum.reduce(top, axis=None) == -np.inf:
+        return found, np.where(top > -np.inf, top, -np.inf)
+    increment = np.log(np.add.reduce(np.exp(found.log - top), axis=0)) + top
+    found = Mixture(found.log - increment, found.mean, found.factor)
+    return whole(place, found) if place.is_carried else found, increment
 
 
-def taken(
-    place: Place, by_kind: bool, mean: np.ndarray, factor: np.ndarray, turning: bool = False
-) -> Any:
-    """Kinds or pairs given a row: means, log densities of the row, and what conditions them.
+class Taken(NamedTuple):
+    """Kinds or pairs given a row, of the numbers that are worked out.
 
-    With ``turning`` standardised innovations are last.
+    Attributes
+    ----------
+    mean : ndarray, shape (size, *lead, kept)
+    factor : ndarray, shape (size, *lead, kept, kept)
+    log : ndarray, shape (size, *lead)
+        Log densities of the row.
+    made : Conditioned
+    eta : ndarray, shape (size, *lead, observed)
+        Standardised innovations.
     """
+
+    mean: np.ndarray
+    factor: np.ndarray
+    log: np.ndarray
+    made: Conditioned
+    eta: np.ndarray
+
+
+def _taken(
+    place: Place, by_kind: bool, mean: np.ndarray, factor: np.ndarray, turning: bool = False
+) -> Taken:
+    """Kinds or pairs given a row; with ``turning`` they say what the slice before had to do with it."""
     layout, pattern = place.layout, place.pattern
     expected, rows, terms = place.stretch.expected(place.at, pattern, by_kind, mean, factor)
-    made = condition(rows, len(pattern.observed), layout.n_prev if turning else None)
+    p = len(pattern.observed)
+    made = condition(rows, p, layout.n_prev) if turning else condition_many(rows, p)
+    if pattern.absent is None and made.certain is None:
+        off = place.row - expected[..., :p]
+        eta = (
+            off / made.root[..., 0]
+            if p == 1
+            else np.linalg.solve(made.root, off[..., None])[..., 0]
+        )
+        after = expected[..., p:] + np.matvec(made.gain, eta)
+        return Taken(after, made.factor, log_densities(made.root, eta), made, eta)
     after, eta, log = absorbed(layout, pattern, made, expected, place.row, place.given, terms=terms)
-    return (after, log, made, eta) if turning else (after, log, made)
+    after = after[..., pattern.kept - layout.p]
+    wide = np.broadcast_to(made.factor, (*after.shape, after.shape[-1]))
+    return Taken(after, wide, log, made, eta)
 
 
-def roots_of(place: Place, made: Conditioned, shape: tuple[int, ...]) -> np.ndarray:
-    """Roots of the covariances of all unknown numbers."""
-    factor = full_factor(place.layout, place.pattern, made.factor)
-    if factor.shape[:-2] == shape:
-        return factor
-    return np.broadcast_to(factor, shape + factor.shape[-2:])
+def whole(place: Place, found: Mixture) -> Mixture:
+    """With all unknown numbers, those that are observed in this slice, too."""
+    layout, pattern = place.layout, place.pattern
+    if pattern.given is None or found.mean.shape[-1] > len(pattern.kept):
+        return found
+    assert place.given is not None
+    given = place.given if place.given.ndim <= 1 + len(layout.lead) else place.given[:, None]
+    mean = np.zeros((*found.log.shape, layout.n))
+    mean[..., pattern.kept - layout.p] = found.mean
+    mean = np.where(pattern.given, given, mean)
+    return Mixture(found.log, mean, full_factor(layout, pattern, found.factor))
 
 
 class Back(NamedTuple):
@@ -144,14 +182,15 @@ def turned_back(before: Mixture, place: Place) -> Back:
     own = total[pairs.dst]
     log = np.where(own > -np.inf, log - np.where(own > -np.inf, own, 0.0), -np.inf)
     start = before.first(c)
-    after, _, made, eta = taken(place, False, start.mean[pairs.src], start.factor[pairs.src], True)
+    found = _taken(place, False, start.mean[pairs.src], start.factor[pairs.src], True)
     p, carried = len(pattern.observed), place.layout.carried
-    factor = roots_of(place, made, after.shape[:-1])
-    turn = np.broadcast_to(made.turn, (*after.shape[:-1], *made.turn.shape[-2:]))
+    after = whole(place, Mixture(log, found.mean, found.factor)).first(carried)
+    assert found.made.turn is not None
+    turn = np.broadcast_to(found.made.turn, (*log.shape, *found.made.turn.shape[-2:]))
     return Back(
         log,
-        Mixture(log, after, factor).first(carried),
-        multiplied(turn[..., :p], eta),
+        after,
+        np.matvec(turn[..., :p], found.eta),
         turn[..., p : p + carried],
         turn[..., p + carried :],
     )
@@ -196,11 +235,10 @@ def smoothed(back: Back, place: Place, filtered: Mixture, later: Smoothed) -> Sm
     log = later.log[dst] + back.log
     groups = pairs.by_src
     assert groups is not None
-    members = groups.members
     whole = merged(
         groups.logs(log),
-        (back.shift + found[..., 0])[members],
-        np.concatenate(parts, axis=-1)[members],
+        groups.of(back.shift + found[..., 0]),
+        groups.of(np.concatenate(parts, axis=-1)),
     )
     return Smoothed(*whole)
 
@@ -224,9 +262,11 @@ def _ahead(merging: str, before: Mixture | None, place: Place) -> Mixture:
             np.repeat(start.factor, count, axis=0),
         )
     start = before.first(place.layout.n_prev)
-    log = start.log[pairs.src] + log
+    log = start.log.take(pairs.src, axis=0) + log
     if merging == "gpb2":
-        return Mixture(log, start.mean[pairs.src], start.factor[pairs.src])
+        return Mixture(
+            log, start.mean.take(pairs.src, axis=0), start.factor.take(pairs.src, axis=0)
+        )
     groups = pairs.by_kind
     if merging == "imm":
         at = pairs.src[groups.members]

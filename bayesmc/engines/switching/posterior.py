@@ -58,8 +58,13 @@ class Beliefs(NamedTuple):
         """Of the last so many slices."""
         known = {n: v[-steps:] for n, v in self.known.items()}
         by_mode = {n: v[-steps:] for n, v in self.by_mode.items()}
-        cut = (a[-steps:] for a in (self.weights, self.mean, self.factor))
-        return Beliefs(self.layout, self.modes, self.now, *cut, known, by_mode)
+        return self._replace(
+            weights=self.weights[-steps:],
+            mean=self.mean[-steps:],
+            factor=self.factor[-steps:],
+            known=known,
+            by_mode=by_mode,
+        )
 
     def on_plates(self, node: CompiledNode) -> np.ndarray:
         """Weights as they broadcast with a node's values, shape (time, modes, *plates or ones)."""
@@ -131,7 +136,7 @@ class SwitchingSeries(SeriesPosterior):
     >>> filtered.quantile("x", [0.1, 0.9]).shape, filtered.cov("x").shape
     ((3, 2), (3, 1, 1))
     >>> filtered.probability(lambda x, s: (s == "rough") & (x > 4.0)).round(2).tolist()
-    [0.0, 0.0, 0.98]
+    [0.0, 0.0, 0.95]
     """
 
     beliefs: Beliefs
@@ -303,8 +308,8 @@ def _expectation(
     for name in nodes_read(function):
         if name in beliefs.modes.leaves:
             raise UnsupportedError(
-                f"a query reads {name!r}, which is averaged over where it is missing, and functions of it are "
-                "not answered for; use a ParticleFilter"
+                f"a query reads {name!r}, which is averaged over where it is missing, and functions of it "
+                "are not answered for; use a ParticleFilter"
             )
     mean, error = expectation(beliefs.view(), function, event)
     return tuple(beliefs.over_modes(beliefs.split(a)) for a in (mean, error))  # type: ignore[return-value]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -10,7 +11,8 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, SeriesProblem, Slices
 from bayesmc.engines.filtering import pass_slices
-from bayesmc.engines.kalman.data import SeriesData, given_values, pattern_of, stacked
+from bayesmc.engines.kalman.covariances import by_pattern
+from bayesmc.engines.kalman.data import Pattern, SeriesData, given_values, pattern_of, stacked
 from bayesmc.engines.kalman.levels import Rule
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.switching.merging import Mixture
@@ -23,6 +25,7 @@ from bayesmc.engines.switching.passes import (
     smoothed,
     turned_back,
     unsmoothed,
+    whole,
 )
 from bayesmc.engines.switching.posterior import Beliefs, SwitchingSeries, answers, by_modes
 from bayesmc.engines.switching.stretches import Stretch
@@ -77,12 +80,12 @@ class SwitchingRun:
         data, merging = self.data, self.options.merging
         found: list[Mixture] = []
         increments = np.empty((data.steps, *data.layouts[0].lead))
-        places = self.places()
+        places = self.places
 
         def move(k: int) -> None:
             place = places[k]
-            after, increments[k], made = advanced(merging, found[-1] if found else None, place)
-            check_row(data.series.start + k, increments[k], after)
+            after, increments[k] = advanced(merging, found[-1] if found else None, place)
+            check_row(data.series.start + k, increments[k])
             found.append(after if k else self._over_all(after))
 
         def so_far(k: int) -> SwitchingSeries:
@@ -93,7 +96,8 @@ class SwitchingRun:
 
     def smoothed(self, filtered: list[Mixture], lag: int | None) -> list[Mixture]:
         """The same given all rows, or those of so many slices later: Kim's smoother."""
-        carried, steps, places = self.data.layouts[0].carried, self.data.steps, self.places()
+        carried, steps, places = self.data.layouts[0].carried, self.data.steps, self.places
+        filtered = [whole(place, found) for place, found in zip(places, filtered, strict=True)]
         backs: list[Back | None] = [None] * steps
         for k in range(1, steps):
             backs[k] = turned_back(filtered[k - 1], places[k])
@@ -112,19 +116,43 @@ class SwitchingRun:
                     found[k - 1] = _applied(filtered[k - 1], here)
         return found
 
+    @cached_property
     def places(self) -> list[Place]:
         """Every slice with its row."""
-        data, found = self.data, []
+        data = self.data
         patterns, which = data.patterns
-        rows = [data.seen(low, high) for _, (low, high) in data.spans()]
-        for k in range(data.steps):
-            stretch, at = (self.stretches[0], 0) if not k else (self.stretches[1], k - 1)
-            pattern, row = patterns[which[k]], rows[min(k, 1)][at]
-            given = None if data.given is None else data.given[0][k]
-            found.append(
-                Place(stretch, at, pattern, _with_given(stretch.layout, pattern, row, given), given)
-            )
+        values = None if data.given is None else data.given[0]
+        found: list[Any] = [None] * data.steps
+        for _, (low, high) in data.spans():
+            stretch, seen = self.stretches[min(low, 1)], data.seen(low, high)
+            for group in by_pattern(which[low:high]):
+                pattern = patterns[which[low + group[0]]]
+                given = None if values is None else values[low:high][group]
+                rows = _with_given(stretch.layout, pattern, seen[group], given)
+                carried = _is_carried(stretch.layout, pattern)
+                for m, (k, row) in enumerate(zip(group.tolist(), rows, strict=True)):
+                    own = None if given is None else given[m]
+                    found[low + k] = Place(stretch, k, pattern, row, own, carried)
         return found
+
+    def whole(self, found: list[Mixture]) -> Mixture:
+        """All unknown numbers of the first so many slices, time first."""
+        which = self.data.patterns[1][: len(found)]
+        places, steps, first = self.places, len(found), found[0]
+        lead = first.log.shape
+        n = self.data.layouts[0].n
+        log, mean = np.empty((steps, *lead)), np.empty((steps, *lead, n))
+        factor = np.empty((steps, *lead, n, n))
+        for group in by_pattern(which):
+            arrays = (np.stack(a) for a in zip(*(found[k] for k in group), strict=True))
+            place = places[group[0]]
+            if self.data.given is not None:
+                place = place._replace(given=self.data.given[0][group])
+            for array, part in zip(
+                (log, mean, factor), whole(place, Mixture(*arrays)), strict=True
+            ):
+                array[group] = part
+        return Mixture(log, mean, factor)
 
     def answers(
         self, kind: str, found: list[Mixture], increments: np.ndarray, queries: Any = None
@@ -135,11 +163,11 @@ class SwitchingRun:
         known = {n: series.observed[n].value[:steps] for n in data.known}
         known |= {n: o.value for n, o in series.static.items()} | data.computed(steps)
         known = {n: np.broadcast_to(v, (steps, *model[n].value_shape)) for n, v in known.items()}
-        told = {
-            n: tuple(None if a is None else a[:steps] for a in pair)
-            for n, pair in self.told.items()
+        told: dict[str, tuple[Any, Any]] = {
+            n: (one[:steps], None if two is None else two[:steps])
+            for n, (one, two) in self.told.items()
         }
-        weights, mean, factor = (np.stack(a) for a in zip(*found, strict=True))
+        weights, mean, factor = self.whole(found)
         beliefs = Beliefs(
             data.layouts[0], self.modes, self.now, np.exp(weights), mean, factor, known,
             values_by_mode(model, told),
@@ -259,9 +287,11 @@ def row_taken(
     pattern = pattern_of(layout, nothing if found is None else found[1])
     given = None if found is None else found[0]
     target = stacked(layout, {n: row.seen[n].value for n in layout.seen}, ())
-    place = Place(stretch, 0, pattern, _with_given(layout, pattern, target, given), given)
-    after, increment, _ = advanced(options.merging, None if before is None else before.found, place)
-    check_row(row.t, increment, after)
+    target = _with_given(layout, pattern, target, given)
+    place = Place(stretch, 0, pattern, target, given, _is_carried(layout, pattern))
+    after, increment = advanced(options.merging, None if before is None else before.found, place)
+    after = whole(place, after)
+    check_row(row.t, increment)
     known = {n: row.seen[n].value for n in seen}
     plain = (n for n in layout.computed if n not in modes.names and not _of_modes(modes, layout, n))
     known |= {n: _evaluated(layout, n, {**static, **values}) for n in plain}
@@ -270,20 +300,21 @@ def row_taken(
     return state, increment
 
 
-def check_row(t: int, increment: np.ndarray, found: Mixture) -> None:
+def check_row(t: int, increment: Any) -> None:
     """Refuse a row that no mode can have.
 
     Raises
     ------
     ZeroProbabilityError, DegeneracyError
     """
-    if (increment == -np.inf).any():
+    if increment.ndim == 0 and math.isfinite(increment) or np.isfinite(increment).all():
+        return
+    if not np.isnan(increment).any() and (increment < np.inf).all():
         raise ZeroProbabilityError(
-            f"the row of slice {t} has probability zero given those before, whatever the modes; check the row, "
-            "or give what is known without noise (a scale of 0, a probability of 0) a little"
+            f"the row of slice {t} has probability zero given those before, whatever the modes; check the "
+            "row, or give what is known without noise (a scale of 0, a probability of 0) a little"
         )
-    if not (np.isfinite(increment).all() and np.isfinite(found.mean).all()):
-        raise DegeneracyError(f"the row of slice {t} has no density given those before", t)
+    raise DegeneracyError(f"the row of slice {t} has no density given those before", t)
 
 
 def values_by_mode(model: Any, told: Mapping[str, tuple[Any, Any]]) -> dict[str, np.ndarray]:
@@ -313,6 +344,11 @@ def _applied(filtered: Mixture, later: Smoothed) -> Mixture:
     mean = filtered.mean + np.matvec(left, later.noise)
     factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
     return Mixture(later.log, mean, factor)
+
+
+def _is_carried(layout: Layout, pattern: Pattern) -> bool:
+    """Whether the next slice reads numbers that are observed in this one."""
+    return pattern.given is not None and bool(pattern.given[..., : layout.carried].any())
 
 
 def _with_given(

@@ -1,8 +1,6 @@
 """Slices as numbers: how probable their modes are given those before, and their coefficients given both.
 
-A *pair* is a mode of the slice before and one of this slice that may follow it; slice 0 has modes alone.
-Pairs whose Gaussian nodes have the same coefficients are of one *kind*: often there is one kind for each mode
-of this slice. All pairs and all slices of a stretch are worked out together.
+All pairs of modes (``pairs``) and all slices of a stretch are worked out together.
 """
 
 from __future__ import annotations
@@ -10,21 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME
 from bayesmc.engines.filtering import in_slice
-from bayesmc.engines.kalman.covariances import rows_of
+from bayesmc.engines.kalman.covariances import without_absent
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.levels import Plan, Rule, expected_slice
 from bayesmc.engines.kalman.passes import Ahead, Expected, Memory
 from bayesmc.engines.kalman.reading import Linear, composed, reads_time
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.switching.modes import Modes
+from bayesmc.engines.switching.pairs import Pairs
 from bayesmc.errors import BayesmcError, UnsupportedError
-from bayesmc.linalg.square_root import multiplied
 from bayesmc.network import Observed
 from bayesmc.network.forward import summed
 from bayesmc.network.model import invalid_error
@@ -33,85 +32,6 @@ from bayesmc.network.noiseless import point_log_density
 #: entries of a table over time and pairs
 _ENTRIES = 1 << 25
 _NONE = np.zeros(0, dtype=np.intp)
-
-
-class Groups(NamedTuple):
-    """Members of groups, one group after the other.
-
-    Attributes
-    ----------
-    members : ndarray of int, shape (groups, size)
-    valid : ndarray of bool or None
-        Which of them are members, where groups are of unequal size.
-    """
-
-    members: np.ndarray
-    valid: np.ndarray | None
-
-    @property
-    def are_single(self) -> bool:
-        """Whether every group has the member of its own number, and no other."""
-        return self.valid is None and self.members.shape[1] == 1
-
-    def logs(self, log: np.ndarray) -> np.ndarray:
-        """Logs of members' weights, shape (groups, size, *rest)."""
-        found = log[self.members]
-        if self.valid is None:
-            return found
-        return np.where(
-            self.valid.reshape(self.valid.shape + (1,) * (log.ndim - 1)), found, -np.inf
-        )
-
-
-def grouped(of: np.ndarray, count: int) -> Groups:
-    """Members by the group that they are ``of``."""
-    order = np.argsort(of, kind="stable")
-    sizes = np.bincount(of, minlength=count)
-    most = max(int(sizes.max(initial=0)), 1)
-    valid = np.arange(most) < sizes[:, None]
-    members = np.zeros((count, most), dtype=np.intp)
-    members[valid] = order
-    return Groups(members, None if valid.all() else valid)
-
-
-class Pairs:
-    """Which modes may follow which.
-
-    Parameters
-    ----------
-    before, now : ndarray of int
-        Configurations that there are; ``before`` is empty in slice 0.
-    src, dst : ndarray of int, shape (pairs,)
-        Places among them, or in slice 0 no ``src``.
-    classes : ndarray of int
-        Of the configurations before: those that Gaussian nodes tell apart.
-
-    Attributes
-    ----------
-    kind : ndarray of int, shape (pairs,)
-    of_kind : ndarray of int, shape (kinds,)
-        A pair of each kind.
-    """
-
-    def __init__(
-        self, before: np.ndarray, now: np.ndarray, src: np.ndarray, dst: np.ndarray, classes: np.ndarray
-    ) -> None:  # fmt: skip
-        self.before, self.now = before, now
-        self.is_first = not len(before)
-        cls = np.zeros(len(dst), dtype=np.intp) if self.is_first else classes[before[src]]
-        order = np.lexsort((src, cls, dst)) if len(src) else np.arange(len(dst))
-        self.src, self.dst = src[order] if len(src) else src, dst[order]
-        key = self.dst * (int(cls.max(initial=0)) + 1) + cls[order]
-        _, self.of_kind, self.kind = np.unique(key, return_index=True, return_inverse=True)
-        self.by_kind = grouped(self.kind, len(self.of_kind))
-        self.by_dst = grouped(self.dst, len(now))
-        self.kinds_by_dst = grouped(self.dst[self.of_kind], len(now))
-        self.by_src = None if self.is_first else grouped(self.src, len(before))
-
-    def values(self, modes: Modes, at: np.ndarray) -> dict[str, np.ndarray]:
-        """Stored values of the modes of some pairs, shape (*at.shape, *plates)."""
-        found = modes.at(self.now[self.dst[at]])
-        return found if self.is_first else found | modes.at(self.before[self.src[at]], PREVIOUS)
 
 
 class Stretch:
@@ -160,9 +80,10 @@ class Stretch:
         self.timed = {n: v for n, v in values.items() if n not in static}
         self.count = count
         self._memory = Memory()
+        self._plan: Plan | None = None
         every = np.arange(modes.count) if now is None else now
         table = self._table(observed, before, every)
-        possible = (table > -np.inf).reshape(*table.shape[:3], -1).any(axis=(0, 3))
+        possible: np.ndarray = (table > -np.inf).reshape(*table.shape[:3], -1).any(axis=(0, 3))  # type: ignore[assignment]
         kept = np.flatnonzero(possible.any(axis=0)) if now is None else np.arange(len(every))
         src, dst = np.nonzero(possible[:, kept])
         if before is None:
@@ -194,26 +115,34 @@ class Stretch:
             return self._made_linear(k, pattern, by_kind, mean, factor)
         timeless = len(self.linear.moves) == 1
 
-        def choose() -> Linear:
-            at = 0 if timeless else k
+        def choose() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            """Offset, moves, and rows in which those on the numbers before are still to come."""
+            at, chosen = 0 if timeless else k, pattern.chosen
             offset, moves, noise = (a[at] for a in self.linear)
-            chosen = pattern.chosen
-            found = Linear(offset[..., chosen], moves[..., chosen, :], noise[..., chosen, :])
-            return found if by_kind else Linear(*(a[self.pairs.kind] for a in found))
+            found = [offset[..., chosen], moves[..., chosen, :], noise[..., chosen, :]]
+            if not by_kind:
+                found = [a.take(self.pairs.kind, axis=0) for a in found]
+            rows = np.zeros((*found[0].shape, c + noise.shape[-1]))
+            rows[..., c:] = found[2]
+            return found[0], found[1], rows
 
+        c = mean.shape[-1]
         key = ("chosen", id(pattern), by_kind)
-        found = self._memory(key, choose) if timeless else choose()
-        rows = rows_of(found.moves, found.noise, factor, pattern.absent)
+        offset, moves, rows = self._memory(key, choose) if timeless else choose()
+        rows = rows.copy()
+        np.matmul(moves, factor, out=rows[..., :c])
+        if pattern.absent is not None:
+            rows = without_absent(rows, pattern.absent)
 
         def terms() -> np.ndarray:
-            return np.abs(found.offset) + multiplied(np.abs(found.moves), np.abs(mean))
+            return np.abs(offset) + np.matvec(np.abs(moves), np.abs(mean))
 
-        return Expected(found.offset + multiplied(found.moves, mean), rows, terms)
+        return Expected(offset + np.matvec(moves, mean), rows, terms)
 
-    @property
+    @cached_property
     def linear(self) -> Linear:
         """Coefficients by slice and kind, shape (time or 1, kinds, *lead or ones, ...)."""
-        return self._memory("linear", self._coefficients)
+        return self._coefficients()
 
     def known(self, k: int, pair: int) -> dict[str, np.ndarray]:
         """All known values of the k-th slice given the modes of a pair."""
@@ -285,7 +214,7 @@ class Stretch:
 
         if not reads_time(layout, still):
             return over({n: v[:1] for n, v in self.timed.items()}, {})
-        parts = self._in_time(lambda *given: [over(*given)], {})
+        parts: list[Linear] = self._in_time(lambda timed, seen: [over(timed, seen)], {})
         return Linear(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
     def _in_time(self, function: Callable[..., Any], observed: Mapping[str, Observed]) -> Any:
@@ -314,7 +243,7 @@ class Stretch:
         pairs = self.pairs.of_kind if by_kind else np.arange(len(self.pairs.dst))
         for unit, pair in enumerate(pairs):
             values = self.known(k, int(pair))
-            plan = self._memory("plan", lambda values=values: Plan(layout, values))
+            plan = self._plan = self._plan or Plan(layout, values)
             ahead = Ahead(layout, values, mean[unit], factor[unit], pattern, self._memory)
             parts.append(expected_slice(ahead, self.rule, plan))
         widest = max(rows.shape[-1] for _, rows in parts)
@@ -429,10 +358,9 @@ def _behind_time(array: np.ndarray) -> np.ndarray:
 
 def _counts(total: np.ndarray, batch: tuple[int, ...]) -> np.ndarray:
     """Which parts of a batch are possible so far."""
-    possible = (total > -np.inf).reshape(*total.shape[:3], -1).any(axis=3)
-    for axis in range(3):
-        if not batch or batch[axis] == 1:
-            possible = possible.any(axis=axis, keepdims=True)
+    single = tuple(axis for axis in range(3) if not batch or batch[axis] == 1)
+    largest = np.max(total.reshape(*total.shape[:3], -1), axis=3)
+    possible = np.max(largest, axis=single, keepdims=True) > -np.inf
     return np.broadcast_to(possible, batch) if batch else possible.reshape(())
 
 

@@ -1,7 +1,7 @@
 """Random switching templates with data: linear-Gaussian given finite nodes, which are hidden, too.
 
-What random linear-Gaussian templates hold, and modes that their means and scales depend on: one finite node or
-two, with memory or without, in plates or not, that depend on each other, on inputs and on time, that some
+What random linear-Gaussian templates hold, and modes that their means and scales depend on: one finite node
+or two, with memory or without, in plates or not, that depend on each other, on inputs and on time, that some
 functions read of the slice before, with states that cannot follow each other, and finite sensors of them.
 Exact conditioning of the unrolled net, whose cost grows with the histories of modes, gives the answers.
 """
