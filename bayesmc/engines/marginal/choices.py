@@ -17,6 +17,7 @@ import numpy as np
 
 from bayesmc.categorical import log_sum_exp
 from bayesmc.dbn import Row
+from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.gaussians import Coefficients
 from bayesmc.engines.marginal.reading import SliceReader, Values
@@ -26,6 +27,8 @@ from bayesmc.errors import UnsupportedError
 from bayesmc.network.forward import summed
 from bayesmc.structure.tables import configurations
 
+#: sets of kinds whose coefficients are kept
+_KEPT = 64
 #: joint states of the finite nodes of a slice above which it refuses
 MOST = 256
 
@@ -77,6 +80,7 @@ class Choices:
             )
         found, sizes = configurations([], nodes, layout.apart)
         self.count = int(np.prod(sizes))
+        self._kept: dict[bytes, tuple[np.ndarray, Linear]] = {}
         self.values = {
             n.name: np.broadcast_to(v, (*sizes, *n.plate_shape)).reshape(-1, *n.plate_shape)
             for n, v in zip(nodes, found, strict=True)
@@ -90,19 +94,20 @@ class Choices:
         The first have shape ``(particles, choices, *lead)``.
         """
         kinds = reader.kinds(values, sorted(values.own))
-        which = None if kinds is None else kinds.of_kind
-        own = values.at(which)
-        count = values.particles if kinds is None else len(kinds.of_kind)
-        both = {}
-        for name, value in own.items():
-            varies = name in values.own
-            both[name] = value.repeat(self.count, axis=0) if varies else value
-        for name, value in self.values.items():
-            both[name] = np.tile(value, (count, *(1,) * (value.ndim - 1)))
-        log = self._log_factors(dict(both), row).reshape(count, self.count, *self.layout.lead)
-        kind = None if kinds is None else kinds.kind
-        found = reader.read_choices(both, count, self.count, kind)
-        return log if kind is None else log.take(kind, axis=0), found
+        if kinds is None:
+            log, made = self._worked_out(values, None, row, reader)
+            return log, Coefficients(*made, None)
+        key = kinds.codes.tobytes()
+        found = None if reader.changing(values, reader.needed) else self._kept.get(key)
+        if found is None:
+            found = self._worked_out(values, kinds.of_kind, row, reader)
+            if len(self._kept) >= _KEPT:
+                self._kept.clear()
+            self._kept[key] = found
+        log, (offset, moves, noise) = found
+        kind = kinds.kind
+        offset = offset.take(kind, axis=0)
+        return log.take(kind, axis=0), Coefficients(offset, moves, noise, kind)
 
     def drawn(self, log: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """The logs' sums over choices, and one choice for each particle by them, shape (particles, *lead)."""
@@ -127,6 +132,20 @@ class Choices:
         return found
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _worked_out(
+        self, values: Values, which: np.ndarray | None, row: Row, reader: SliceReader
+    ) -> tuple[np.ndarray, Linear]:
+        """Log densities and coefficients by kind and choice; every particle is a kind with None."""
+        count = values.particles if which is None else len(which)
+        both = {
+            name: value.repeat(self.count, axis=0) if name in values.own else value
+            for name, value in values.at(which).items()
+        }
+        for name, value in self.values.items():
+            both[name] = np.tile(value, (count, *(1,) * (value.ndim - 1)))
+        log = self._log_factors(dict(both), row).reshape(count, self.count, *self.layout.lead)
+        return log, reader.read_choices(both, count, self.count)
 
     def _log_factors(self, values: dict[str, np.ndarray], row: Row) -> np.ndarray:
         """Log densities of all nodes that have a value, shape (kinds * choices, *lead)."""

@@ -18,6 +18,7 @@ NOT_LAGGED = (
     "ParticleFilter: lag= answers by the ancestors of later particles, and these tell nothing of what "
     "marginalize= integrates out; smooth without lag=, or give marginalize=None"
 )
+_SEEN = "observed, weights the particles by its predictive density"
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
 
@@ -120,8 +121,8 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     split = split_of_problem(engine, problem)
     if split is None:
         return ()
-    inner = ", ".join(map(repr, split.inner))
-    return (f"every other hidden node can be sampled, and given these {inner} can be integrated out",)
+    inner = ", ".join(repr(n) for n in split.inner if n not in problem.series.observed)
+    return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
 
 
 def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
@@ -133,11 +134,11 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
     slices = problem.slices
     for name in slices.dynamic:
         if name in split.inner:
-            seen = name in problem.series.observed
-            partly = ", observed where it is not missing" if seen else ""
-            found[name] = f"integrated out, a Kalman filter for each particle{partly}"
+            found[name] = "integrated out, a Kalman filter for each particle"
+            if name in problem.series.observed:
+                found[name] = f"{_SEEN}; integrated out where it is missing"
         elif name in split.below:
-            found[name] = "observed, weights the particles by its predictive density"
+            found[name] = _SEEN
         elif name in split.why:
             found[name] += f"; not integrated out: {split.why[name]}"
         elif (

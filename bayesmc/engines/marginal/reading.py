@@ -120,23 +120,21 @@ class SliceReader:
         if kinds is None:
             finite = [n for n in varying if self.layout.model[n].domain is not None]
             return self._shared(self._composed(values, None), self.kinds(values, finite), values)
-        changing = self.leaves & values.plain.keys() - set(self.layout.slices.template.static)
-        if changing:
+        if self.changing(values, self.leaves):
             found, kind = self._composed(values, kinds.of_kind), kinds.kind
         else:
             found, kind = self._remembered(values, kinds)
         offset = found.offset.take(kind, axis=0)
         return _with_choices(offset, found.moves, found.noise, kind)
 
-    def read_choices(
-        self, values: Mapping[str, np.ndarray], kinds: int, choices: int, kind: np.ndarray | None
-    ) -> Coefficients:
-        """The same for all choices of finite nodes; ``values`` have an axis of kinds times choices first."""
+    def changing(self, values: Values, leaves: frozenset[str]) -> bool:
+        """Whether anything is read that is the same for all particles, and not in all slices."""
+        return bool(leaves & values.plain.keys() - set(self.layout.slices.template.static))
+
+    def read_choices(self, values: Mapping[str, np.ndarray], kinds: int, choices: int) -> Linear:
+        """The same by kind and choice of finite nodes; ``values`` have an axis of both together first."""
         made = composed(self.layout, dict(values), (kinds * choices,))
-        offset, moves, noise = (a.reshape(kinds, choices, *a.shape[1:]) for a in made)
-        return Coefficients(
-            offset if kind is None else offset.take(kind, axis=0), moves, noise, kind
-        )
+        return Linear(*(a.reshape(kinds, choices, *a.shape[1:]) for a in made))
 
     # ---- private -------------------------------------------------------------------------------
 

@@ -123,6 +123,11 @@ class _Search:
                     f"marginalize= names {name!r}, and that node {reason}; leave it out"
                 )
         inner = set(names)
+        read = {p for model in self.models for n in self.slices.dynamic for p in model[n].parents}
+        read = {p.removesuffix(PREVIOUS) for p in read}
+        for name in self.hidden:  # what is measured of them, where it is missing
+            if name not in read and self._never(name) is None and self._above((name,), inner):
+                inner.add(name)
         for name in self.hidden:
             above = [] if name in inner else sorted(self._above((name,), inner))
             if above:
