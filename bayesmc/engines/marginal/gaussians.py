@@ -18,7 +18,7 @@ from bayesmc.engines.kalman.covariances import full_factor, without_absent
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.means import absorbed
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.linalg.square_root import Conditioned, condition
+from bayesmc.linalg.square_root import Conditioned, condition_many
 from bayesmc.network import CompiledNode
 
 #: kinds of coefficients up to which all of them are applied to all means, by one product of matrices
@@ -226,7 +226,7 @@ def _conditioned(
     rows[..., c:] = noise
     if pattern.absent is not None:
         rows = without_absent(rows, pattern.absent)
-    return condition(rows, len(pattern.observed))
+    return condition_many(rows, len(pattern.observed))
 
 
 def _expected(

@@ -37,9 +37,7 @@ def mixture_quantiles(
     return found.reshape(*levels.shape, *found.shape[1:])
 
 
-def covariance_within(
-    inner: Gaussians, sizes: Mapping[str, int], shares: np.ndarray
-) -> np.ndarray:
+def covariance_within(inner: Gaussians, sizes: Mapping[str, int], shares: np.ndarray) -> np.ndarray:
     """Mean of the particles' covariances of nodes one after the other; 0 for what they know.
 
     Parameters
