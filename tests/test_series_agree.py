@@ -36,8 +36,10 @@ from tests.matrix_time import (
     EVEN,
     FEW,
     MANY,
+    MARGINAL,
     PARTICLES,
     RUNS,
+    TRIED,
     answered,
     cases,
     hidden,
@@ -47,6 +49,7 @@ from tests.matrix_time import (
 from tests.stated import stated_errors_test
 
 ALPHA = 1e-4
+VARIANTS = PARTICLES | MARGINAL
 
 
 @pytest.mark.parametrize("engine", COMPUTING)
@@ -101,15 +104,14 @@ def function_of(exact: Any, node: Any) -> tuple[Any, np.ndarray]:
 
 
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")
-@pytest.mark.parametrize("kind", ["finite", "linear"])
-@pytest.mark.parametrize("variant", PARTICLES)
+@pytest.mark.parametrize(("variant", "kind"), TRIED)
 def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
     """Evidence, filtered and smoothed figures, of fifty particles."""
-    engine = bmc.ParticleFilter(50, **PARTICLES[variant])
+    engine = bmc.ParticleFilter(50, **VARIANTS[variant])
     tried = 0
     chosen = list(cases(kind, 3 * FEW))
     if not session.is_thorough():  # variants take turns at templates
-        chosen = chosen[list(PARTICLES).index(variant) :: len(PARTICLES)]
+        chosen = chosen[list(VARIANTS).index(variant) :: len(VARIANTS)]
     for seed, case in chosen:
         options: dict[str, Any] = {"alpha": ALPHA, "rng": np.random.SeedSequence([seed, 5])}
         evidence = unbiased_evidence_test(
@@ -130,14 +132,13 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
 
 
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")
-@pytest.mark.parametrize("kind", ["finite", "linear"])
-@pytest.mark.parametrize("variant", PARTICLES)
+@pytest.mark.parametrize(("variant", "kind"), TRIED)
 def test_particle_filters_state_their_errors(variant: str, kind: str) -> None:
     """Of the evidence and of the filtered figures of the last slice; half of them would be caught."""
-    engine = bmc.ParticleFilter(400, **PARTICLES[variant])
+    engine = bmc.ParticleFilter(400, **VARIANTS[variant])
     chosen = list(cases(kind, 3 * FEW))
     if not session.is_thorough():  # variants take turns at templates
-        first = list(PARTICLES).index(variant) % len(chosen)
+        first = list(VARIANTS).index(variant) % len(chosen)
         chosen = chosen[first:] + chosen[:first]
     judged = caught = 0
     for seed, case in chosen:
