@@ -9,8 +9,8 @@ A slice may be taken in for several *choices* of its finite nodes at once; boots
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,8 @@ class Gaussians(NamedTuple):
         Places in the pool; None where every particle has a root of its own.
     seen : frozenset of str
         Nodes that are taken to be seen in full in every slice.
+    over : tuple of ndarray or None, shapes (particles, *lead, n)
+        Means and variances over the choices that each particle had, of which one was drawn.
     """
 
     layout: Layout
@@ -45,25 +47,35 @@ class Gaussians(NamedTuple):
     factors: np.ndarray
     which: np.ndarray | None
     seen: frozenset[str] = frozenset()
+    over: tuple[np.ndarray, np.ndarray] | None = None
 
     def taken(self, ancestors: np.ndarray | None) -> Gaussians:
         """Those of the ancestors, which may differ between elements of plates."""
         if ancestors is None:
-            return self
+            return self._replace(over=None)
         if ancestors.ndim == 1:
             mean = self.mean.take(ancestors, axis=0)
             if self.which is None:
-                return self._replace(mean=mean, factors=self.factors.take(ancestors, axis=0))
-            return self._replace(mean=mean, which=self.which.take(ancestors))
+                factors = self.factors.take(ancestors, axis=0)
+                return Gaussians(self.layout, mean, factors, None, self.seen)
+            which = self.which.take(ancestors)
+            return Gaussians(self.layout, mean, self.factors, which, self.seen)
         mean = np.take_along_axis(self.mean, ancestors[..., None], 0)
         if self.which is not None and len(self.factors) == 1:
-            return self._replace(mean=mean, which=np.zeros(len(mean), dtype=np.intp))
+            which = np.zeros(len(mean), dtype=np.intp)
+            return Gaussians(self.layout, mean, self.factors, which, self.seen)
         factors = np.take_along_axis(self.roots(), ancestors[..., None, None], 0)
-        return Gaussians(self.layout, mean, factors, None)
+        return Gaussians(self.layout, mean, factors, None, self.seen)
 
     def roots(self) -> np.ndarray:
         """Every particle's own, shape (particles, *lead, n, m)."""
         return self.factors if self.which is None else self.factors.take(self.which, axis=0)
+
+    def joined(self, parties: Sequence[Any], at: np.ndarray) -> Gaussians:
+        """Some of those of several parties, one after the other."""
+        means = np.concatenate([p.inner.mean for p in parties])
+        roots = np.concatenate([p.inner.roots() for p in parties])
+        return self._replace(mean=means[at], factors=roots[at], which=None, over=None)
 
     def carried(self) -> Gaussians:
         """Of the numbers that the next slice reads."""
@@ -79,6 +91,23 @@ class Gaussians(NamedTuple):
         rows = self.factors[..., self.layout.rows[node.name], :]
         found = self.layout.unpacked(node, np.vecdot(rows, rows))
         return found if self.which is None else found.take(self.which, axis=0)
+
+    def moments_of(self, node: CompiledNode) -> tuple[np.ndarray, np.ndarray]:
+        """Means and variances of a node, over the choices that there were."""
+        if self.over is None:
+            return self.mean_of(node), self.variance_of(node)
+        place = self.layout.rows[node.name]
+        mean, variance = (self.layout.unpacked(node, a[..., place]) for a in self.over)
+        return mean, variance
+
+    def completed(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Values of all nodes with a belief, one draw for each particle."""
+        layout, found = self.layout, {}
+        drawn = self.drawn(rng) if layout.n else self.mean
+        for name, place in layout.rows.items():
+            found[name] = layout.unpacked(layout.model[name], drawn[..., place])
+            found[name].flags.writeable = False
+        return found
 
     def drawn(self, rng: np.random.Generator) -> np.ndarray:
         """One draw for each particle, shape (particles, *lead, n)."""
@@ -124,6 +153,15 @@ class Taken(NamedTuple):
     mean: np.ndarray
     factors: np.ndarray
     group: np.ndarray | None
+
+    def averaged(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Means and variances over choices, by their shares, shape (particles, choices, *lead)."""
+        variance = np.vecdot(self.factors, self.factors)
+        if self.group is not None:
+            variance = variance.take(self.group, axis=0)
+        mean = np.einsum("ij...,ij...n->i...n", shares, self.mean)
+        away = self.mean - mean[:, None]
+        return mean, np.einsum("ij...,ij...n->i...n", shares, variance + away * away)
 
     def chosen(self, choice: np.ndarray | None) -> Gaussians:
         """With one choice for each particle, shape (particles, *lead); None where there is but one."""

@@ -19,11 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import Row
-from bayesmc.engines.kalman.data import given_values, pattern_of, stacked
+from bayesmc.engines.kalman.data import Pattern, given_values, pattern_of, stacked
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.marginal.choices import Choices
-from bayesmc.engines.marginal.gaussians import Gaussians, nothing, take_in
+from bayesmc.engines.marginal.gaussians import Gaussians, Taken, nothing, take_in
 from bayesmc.engines.marginal.reading import SliceReader, Values
+from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split
 from bayesmc.engines.particles.filter_step import FilterStep, has_weight
 from bayesmc.engines.particles.smc import Particles, Selection
@@ -98,7 +99,7 @@ class MarginalStep(FilterStep):
         self._places: dict[Any, Place] = {}
 
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
-        place = self._place(row, None if earlier is None else earlier.inner)
+        place = self.place(row, None if earlier is None else earlier.inner)
         before, selection = self.chosen(earlier, row, rng)
         before = {k: v for k, v in before.items() if k not in place.reader.hidden_before}
         inner = nothing(place.layout, selection.particles)
@@ -112,12 +113,17 @@ class MarginalStep(FilterStep):
         found = self.weighted(row, values, log, selection)
         if not has_weight(found):
             raise _degenerate(selection.particles, row)
-        self._complete(values, inner, rng)
+        values |= inner.completed(rng)
+        for name in [n for n in values if n not in self.kept]:
+            del values[name]
         return found._replace(inner=inner._replace(seen=self.split.seen))
 
     def stored(self, row: Any, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """All values of the slice that particles have; those that are not kept go later."""
         return {n: values[n] for n in self.slices.dynamic if n in values}
+
+    def scouting(self) -> MarginalScouting:
+        return MarginalScouting(self)
 
     def recycle(self, particles: Particles) -> None:
         """Gaussians look at arrays of theirs for longer."""
@@ -136,27 +142,42 @@ class MarginalStep(FilterStep):
         rng: np.random.Generator,
     ) -> tuple[dict[str, np.ndarray], Any, Gaussians]:
         """The row taken in by the Gaussians: all values that particles have, log weights, beliefs."""
-        layout = place.layout
         known = self._values(place, row, before, values, selection)
-        partly = {n: o for n, o in row.seen.items() if o.mask is not None}
-        found = given_values(layout, partly, ())
-        empty = np.zeros((*layout.lead, layout.n), dtype=bool)
-        pattern = pattern_of(layout, empty if found is None else found[1])
-        given = None if found is None else found[0]
-        target = stacked(layout, {n: row.seen[n].value for n in layout.seen}, ())
-        if given is not None and len(pattern.observed) > layout.p:
-            more = given[..., pattern.observed[layout.p :] - layout.p]
-            target = np.concatenate([target, more], axis=-1)
         if place.choices is None:
-            made = take_in(layout, pattern, inner, place.reader.read(known), target, given)
+            pattern, target, given = seen_of(place.layout, row)
+            coefficients = place.reader.read(known)
+            made = take_in(place.layout, pattern, inner, coefficients, target, given)
             return values, log + made.log[:, 0], made.chosen(None)
-        prior, coefficients = place.choices.read(known, row, place.reader)
-        made = take_in(layout, pattern, inner, coefficients, target, given)
-        own, at = place.choices.drawn(prior + made.log, rng)
-        values |= place.choices.values_at(at)
+        joint, made = self.looked(place, place.choices, row, known, inner)
+        own, at = place.choices.drawn(joint, rng)
+        values |= self.chosen_values(place, place.choices, known, values, at)
+        level = np.where(own > -np.inf, own, 0.0)
+        over = made.averaged(np.exp(joint - level[:, None]))
+        return values, log + own, made.chosen(at)._replace(over=over)
+
+    def looked(
+        self, place: Place, choices: Choices, row: Row, known: Values, inner: Gaussians
+    ) -> tuple[np.ndarray, Taken]:
+        """The row taken in with every choice of finite nodes; logs have shape (particles, choices, *lead)."""
+        pattern, target, given = seen_of(place.layout, row)
+        prior, coefficients = choices.read(known, row, place.reader)
+        made = take_in(place.layout, pattern, inner, coefficients, target, given)
+        return prior + made.log, made
+
+    def chosen_values(
+        self,
+        place: Place,
+        choices: Choices,
+        known: Values,
+        values: Mapping[str, np.ndarray],
+        at: np.ndarray,
+    ) -> dict[str, np.ndarray]:
+        """Values of finite nodes that were drawn, and of what is computed from them."""
+        layout, found = place.layout, choices.values_at(at)
+        whole = {**known.at(None), **values, **found}
         for name in layout.computed:
-            values[name] = layout.model.evaluate(name, {**known.at(None), **values})[0]
-        return values, log + own, made.chosen(at)
+            found[name] = whole[name] = layout.model.evaluate(name, whole)[0]
+        return found
 
     def _values(
         self,
@@ -178,21 +199,7 @@ class MarginalStep(FilterStep):
             into[name] = value
         return Values(plain, own, selection.particles)
 
-    def _complete(
-        self, values: dict[str, np.ndarray], inner: Gaussians, rng: np.random.Generator
-    ) -> None:
-        """Put in draws of what is integrated out, and forget what is not kept."""
-        layout = inner.layout
-        drawn = inner.drawn(rng) if layout.n else None
-        for name, place in layout.rows.items():
-            assert drawn is not None
-            draws = layout.unpacked(layout.model[name], drawn[..., place])
-            draws.flags.writeable = False
-            values[name] = draws
-        for name in [n for n in values if n not in self.kept]:
-            del values[name]
-
-    def _place(self, row: Row, inner: Gaussians | None) -> Place:
+    def place(self, row: Row, inner: Gaussians | None) -> Place:
         """The layout of a row's slice.
 
         Raises
@@ -224,6 +231,20 @@ class MarginalStep(FilterStep):
                 steps = self.sampling.steps_without(row, _left_out(layout))
             self._places[key] = Place(layout, SliceReader(layout), steps, choices)
         return self._places[key]
+
+
+def seen_of(layout: Layout, row: Row) -> tuple[Pattern, np.ndarray, np.ndarray | None]:
+    """What Gaussians see of a row: which numbers, their values, and values of unknown numbers."""
+    partly = {n: o for n, o in row.seen.items() if o.mask is not None}
+    found = given_values(layout, partly, ())
+    empty = np.zeros((*layout.lead, layout.n), dtype=bool)
+    pattern = pattern_of(layout, empty if found is None else found[1])
+    target = stacked(layout, {n: row.seen[n].value for n in layout.seen}, ())
+    if found is None:
+        return pattern, target, None
+    given = found[0]
+    more = given[..., pattern.observed[layout.p :] - layout.p]
+    return pattern, np.concatenate([target, more], axis=-1), given
 
 
 # ---- private ------------------------------------------------------------------------------------

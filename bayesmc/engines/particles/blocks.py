@@ -210,7 +210,7 @@ class Block:
         np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
         if is_integrated(self.slices[0].inner, node.name):
-            inside = [p.inner.variance_of(node) for p in self.slices]
+            inside = [p.inner.moments_of(node)[1] for p in self.slices]
             variance += self.weighted(self.turned(inside, self._axes(node)))
         if angles is not None:
             variance = np.where(angles, circular_variance(cosine, sine), variance)
@@ -285,7 +285,7 @@ def diagnosed(slices: Sequence[Figures], lead: tuple[int, ...]) -> dict[str, np.
 def _values(particles: Particles, node: CompiledNode) -> np.ndarray:
     """What a mean is taken over: of what is integrated out, every particle's own mean."""
     if is_integrated(particles.inner, node.name):
-        return particles.inner.mean_of(node)  # type: ignore[no-any-return]
+        return particles.inner.moments_of(node)[0]  # type: ignore[no-any-return]
     return particles.values[node.name]
 
 

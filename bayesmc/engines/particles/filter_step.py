@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.particles.kld import KLD
+from bayesmc.engines.particles.rare_states import Scouting
 from bayesmc.engines.particles.rejuvenation import Injection
 from bayesmc.engines.particles.smc import BLOCK, Layout, Particles, Selection, SMCStep
 from bayesmc.engines.slice_steps import SlicePlan, size_of
@@ -101,6 +102,10 @@ class FilterStep(SMCStep):
         if row.seen:
             averages = self.injection.options.averaged(averages, row, found.increment)
         return found._replace(averages=averages, injected=injected)
+
+    def scouting(self) -> Scouting:
+        """What sends scouts to states that next to no particle has."""
+        return Scouting(self.slices, self.plan)
 
     def log_first_stage(
         self, before: Mapping[str, np.ndarray], row: Row, rng: np.random.Generator
