@@ -49,6 +49,7 @@ from bayesmc.distributions import (
 )
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
+from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
@@ -81,6 +82,7 @@ __all__ = [
     "Bernoulli",
     "Beta",
     "Binomial",
+    "BoyenKoller",
     "Categorical",
     "Cauchy",
     "Density",
@@ -94,6 +96,7 @@ __all__ = [
     "Exponential",
     "ExtendedKalmanFilter",
     "FactorGraph",
+    "FactoredFrontier",
     "Gamma",
     "Geometric",
     "GridFilter",

@@ -15,6 +15,7 @@ from examples import (
     ceiling_robot,
     central_limit,
     corridor_doors,
+    coupled_chains,
     diagnosis,
     expectation_and_marginal,
     faithful_gibbs,
@@ -46,7 +47,7 @@ FIGURES = (
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
     banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, switching_target,
+    landmark_localization, range_only, coupled_chains, switching_target,
 )  # fmt: skip
 
 

@@ -86,9 +86,17 @@ def cases(kind: str, count: int, first: int = 0) -> Iterator[tuple[int, Series]]
     return itertools.islice(found, count)
 
 
+class Whole(bmc.BoyenKoller):
+    """All that the next slice reads, of what ever meets, in one cluster: the exact filter by another road."""
+
+    def _chosen(self, slices: Any, static: Any, series: Any) -> Callable[[Any], Any]:
+        return lambda plan: [chain.state for chain in plan.chains]
+
+
 #: engines that compute: engine, its tolerance, kinds of templates all of which it answers
 COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
     "DiscreteFilter": (bmc.DiscreteFilter(), 1e-9, ("finite",)),
+    "BoyenKoller, one cluster": (Whole(), 1e-9, ("finite",)),
     "GridFilter": (bmc.GridFilter(), 1e-9, ("finite",)),
     "GridFilter, found": (GRID, 1e-3, ("one number",)),
     "KalmanFilter": (bmc.KalmanFilter(), 1e-7, ("linear",)),

@@ -18,6 +18,8 @@ from tests.matrix_time import MANY, Series, cases
 #: online filters, and kinds of templates that they answer, some of them or all
 ONLINE: dict[str, tuple[Any, tuple[str, ...]]] = {
     "DiscreteFilter": (bmc.DiscreteFilter(), ("finite",)),
+    "BoyenKoller": (bmc.BoyenKoller(), ("finite",)),
+    "FactoredFrontier": (bmc.FactoredFrontier(), ("finite",)),
     "GridFilter": (bmc.GridFilter(), ("finite",)),
     "KalmanFilter": (bmc.KalmanFilter(), ("linear",)),
     "ExtendedKalmanFilter": (bmc.ExtendedKalmanFilter(), ("linear",)),

@@ -14,6 +14,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.testing import session
 from examples import (
+    coupled_chains,
     growth_benchmark,
     nile,
     stochastic_volatility,
@@ -279,3 +280,30 @@ def test_two_samples_of_one_law_pass_and_of_two_laws_fail() -> None:
     one = rng.normal(size=4_000)
     assert weight_collapse.kolmogorov_smirnov(one, rng.normal(size=8_000)) < 1.95
     assert weight_collapse.kolmogorov_smirnov(one, rng.normal(0.1, 1.0, 8_000)) > 1.95
+
+
+def test_coupled_chains_are_near_the_exact_filter() -> None:
+    """Larger clusters are nearer, and those that are found nearest; there is no chance in it."""
+    off = coupled_chains.errors_on_a_short_road(60, 3)
+    assert off["factored frontier"] > off["single stretches"] > off["pairs"] > off["fives"]
+    assert off["pairs that overlap"] < 0.2 * off["pairs"]
+    assert off["clusters found"] < 0.01
+
+
+def test_coupled_chains_are_where_particles_say() -> None:
+    """Forty of them, beside the mean of ten filters and its error; 95 % are to be in its interval."""
+    rows, _ = coupled_chains.drive(coupled_chains.LONG, 60, rng=5)
+    near = coupled_chains.jams(
+        bmc.filter(coupled_chains.road(coupled_chains.LONG), rows), coupled_chains.LONG
+    )
+    runs = [coupled_chains.by_particles(rows, 4000, seed) for seed in range(10)]
+    drawn = np.stack([coupled_chains.jams(run, coupled_chains.LONG) for run in runs])
+    error = drawn.std(axis=0, ddof=1) / np.sqrt(len(runs))
+    apart = np.abs(near - drawn.mean(axis=0))
+    assert np.mean(apart <= 2.262 * error) > 0.85  # few particles have a bias of their own
+    single = bmc.BoyenKoller(coupled_chains.groups(coupled_chains.LONG, 1))
+    far = coupled_chains.jams(
+        bmc.filter(coupled_chains.road(coupled_chains.LONG), rows, engine=single),
+        coupled_chains.LONG,
+    )
+    assert np.mean(np.abs(far - drawn.mean(axis=0)) <= 2.262 * error) < 0.75

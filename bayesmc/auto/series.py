@@ -12,6 +12,7 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
+from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
@@ -25,6 +26,7 @@ from bayesmc.results import SeriesPosterior
 #: engines in the order in which they are tried
 _CANDIDATES: tuple[type[FilterEngine], ...] = (
     DiscreteFilter,
+    BoyenKoller,
     KalmanFilter,
     GridFilter,
     SwitchingKalmanFilter,
@@ -32,6 +34,7 @@ _CANDIDATES: tuple[type[FilterEngine], ...] = (
 )
 _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
+    "BoyenKoller": "all hidden nodes are finite, but too many for one joint state",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
     "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate",
     "ParticleFilter": "every hidden node can be sampled given its parents",
@@ -287,6 +290,8 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
     plain = Asked(asked.what)
     for candidate in _CANDIDATES:
         engine, name = _made(candidate, problem, asked), candidate.__name__
+        if isinstance(engine, BoyenKoller) and not DiscreteFilter().is_out_of_room(problem):
+            continue  # it has nothing to say that an exact filter does not
         reason = engine.refusal(problem)
         if reason is None:
             reason = engine.unable(problem, asked)

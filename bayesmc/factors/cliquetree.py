@@ -232,7 +232,7 @@ class CliqueTree(TreeStructure):
         DensityError
             If an entry is negative, NaN or infinite.
         """
-        placements = self._placements
+        placements = self.placements
         if len(factors) != len(placements):
             raise ShapeError(
                 f"CliqueTree.bind: {len(factors)} factors for {len(placements)} scopes; give one "
@@ -263,7 +263,7 @@ class CliqueTree(TreeStructure):
         return found
 
     @cached_property
-    def _placements(self) -> list[Placement]:
+    def placements(self) -> list[Placement]:
         found = []
         for scope in self._scopes:
             own = tuple(self.cardinalities[v] for v in scope)
@@ -293,13 +293,13 @@ class BoundTree:
     @cached_property
     def _linear(self) -> tuple[Potentials, float] | None:
         tree = self.tree
-        found = multiply_linear(tree.shapes, tree._placements, self._given)
+        found = multiply_linear(tree.shapes, tree.placements, self._given)
         return None if found is None else (Potentials(found[0], LINEAR), found[1])
 
     @cached_property
     def _log(self) -> tuple[Potentials, float]:
         tree = self.tree
-        tables, log_scale = add_logs(tree.shapes, tree._placements, self._given)
+        tables, log_scale = add_logs(tree.shapes, tree.placements, self._given)
         return Potentials(tables, LOG), log_scale
 
     def calibrate(

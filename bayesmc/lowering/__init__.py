@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
+from bayesmc.lowering.gaussians import Coefficients, GaussianLoops, gaussian_loops
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available
 from bayesmc.lowering.trajectory import Told, Trajectories
@@ -16,12 +17,15 @@ from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
     "Bound",
+    "Coefficients",
     "Compiled",
+    "GaussianLoops",
     "Kernel",
     "SliceKernel",
     "Told",
     "Trajectories",
     "compiled",
+    "gaussian_loops",
     "held_against_numpy",
     "is_available",
     "is_worth_it",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import json
 import pickle
@@ -13,7 +14,9 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc import SwitchingKalmanFilter
+from bayesmc.engines.switching import run
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError, ZeroProbabilityError
+from bayesmc.lowering import is_available
 from bayesmc.testing import exact, session
 from bayesmc.testing.makers.linear_dbns import LinearSeries
 from bayesmc.testing.makers.switching_dbns import random_switching_dbn
@@ -36,13 +39,14 @@ def figures(answer: Any, names: Any, finite: Any) -> list[np.ndarray]:
     ]
 
 
-def exact_of(case: LinearSeries, count: int | None = None) -> Any:
-    """None where histories are too many."""
-    rows = case.observations if count is None else case.rows(count)
+@functools.cache
+def answered(seed: int, difference: float) -> tuple[LinearSeries, Any]:
+    """A random template and its exact answer, None where histories are too many."""
+    case = random_switching_dbn(seed, difference)
     try:
-        return exact(case.dbn, rows, case.inputs or None)
+        return case, exact(case.dbn, case.observations, case.inputs or None)
     except (UnsupportedError, BudgetError):
-        return None
+        return case, None
 
 
 def finite(case: LinearSeries) -> set[str]:
@@ -56,8 +60,7 @@ def finite(case: LinearSeries) -> set[str]:
 def test_modes_that_make_no_difference_leave_all_exact(merging: str) -> None:
     asked = 0
     for seed in SEEDS:
-        case = random_switching_dbn(seed, difference=0.0)
-        right = exact_of(case)
+        case, right = answered(seed, 0.0)
         if right is None:
             continue
         options: dict[str, Any] = {"inputs": case.inputs, "engine": SwitchingKalmanFilter(merging)}
@@ -110,9 +113,8 @@ def test_random_templates_are_near_exact_answers_and_rules_in_order() -> None:
     """Bounds are some three times what 57 templates gave: .0013, .014, .042 on average."""
     errors: dict[str, list[float]] = {rule: [] for rule in RULES}
     shares: dict[str, list[float]] = {rule: [] for rule in RULES}
-    for seed in range(session.scaled(24, 4)):
-        case = random_switching_dbn(seed)
-        right = exact_of(case)
+    for seed in range(session.scaled(16, 5)):
+        case, right = answered(seed, 1.0)
         if right is None:
             continue
         for rule in RULES:
@@ -126,6 +128,32 @@ def test_random_templates_are_near_exact_answers_and_rules_in_order() -> None:
     assert means["gpb2"] < means["imm"] < means["gpb1"], means
     assert means["gpb2"] < 0.005 and means["imm"] < 0.04 and means["gpb1"] < 0.12, means
     assert np.mean(shares["gpb2"]) < 0.02, shares
+
+
+def test_vague_starts_lose_no_digits() -> None:
+    """Two modes that are alike, of a level and a slope of which nothing is known."""
+    found = []
+    for modes in (0, 1):
+        dbn = bmc.DynamicBayesNet()
+        if modes:
+            dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.4, 0.6]], initial=[0.5, 0.5])
+        dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 0.1), initial=bmc.Normal(0.0, 1e7))
+        dbn.add(
+            "x",
+            lambda x_prev, v_prev: bmc.Normal(x_prev + v_prev, 0.1),
+            initial=bmc.Normal(0.0, 1e7),
+        )
+        if modes:
+            dbn.add("y", lambda x, s: bmc.Normal(x + 0.0 * s, 0.5))
+        else:
+            dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+        engine = SwitchingKalmanFilter() if modes else bmc.KalmanFilter()
+        found.append(bmc.smooth(dbn, {"y": [1.0, 2.5, 2.9, np.nan, 5.2]}, engine=engine))
+    one, two = found
+    assert off(one.log_marginal_increments, two.log_marginal_increments) < 1e-9
+    for name in ("x", "v"):
+        assert off(one.mean(name), two.mean(name)) < 1e-8
+        assert off(one.var(name), two.var(name)) < 1e-8
 
 
 # ---- published and independent figures ----------------------------------------------------------
@@ -463,7 +491,9 @@ def test_linearised_slices_are_those_of_the_extended_filter() -> None:
         assert off(one.mean("x"), two.mean("x")) < 1e-10
         assert off(one.var("x"), two.var("x")) < 1e-10
         assert off(one.log_marginal_likelihood, two.log_marginal_likelihood) < 1e-10
-    dbn.add("z", lambda x: bmc.Gamma(9.0, 9.0 / np.exp(x)))  # missing now and then, it tells nothing then
+    dbn.add(
+        "z", lambda x: bmc.Gamma(9.0, 9.0 / np.exp(x))
+    )  # missing now and then, it tells nothing then
     rows["z"] = [1.0, 0.7, np.nan, 2.0]
     one = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter(linearize=True))
     two = bmc.smooth(dbn, rows, engine=bmc.ExtendedKalmanFilter())
@@ -579,3 +609,36 @@ def test_it_is_chosen_for_switching_templates_and_says_what_it_is() -> None:
     assert isinstance(found.engine, SwitchingKalmanFilter) and found.engine.merging == "gpb2"
     assert "approximation of unknown error" in str(found)
     assert bmc.filter(dbn, {"y": [0.0, 1.0, 2.0]}).log_marginal_likelihood_mcse is None
+
+
+@pytest.mark.skipif(not is_available(), reason="llvmlite is not installed")
+@pytest.mark.parametrize("merging", RULES)
+def test_machine_code_gives_the_same(merging: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of random templates, and of one without noise in its readings, which it leaves to NumPy."""
+    singular = bmc.DynamicBayesNet()
+    singular.table("mode", ["mode_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
+    singular.add("a", lambda a_prev: bmc.Normal(0.9 * a_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    singular.add("b", lambda b_prev: bmc.Normal(b_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    singular.add("y", lambda a, b, mode: bmc.Normal(a + b + 3.0 * mode, 0.0))
+    rows = {"y": np.random.default_rng(0).normal(size=6)}
+    made = [random_switching_dbn(seed) for seed in SEEDS]
+    cases = [(c.dbn, c.observations, c.inputs) for c in made] + [(singular, rows, {})]
+    compiled = 0
+    for dbn, observations, inputs in cases:
+        found = []
+        for least in (1, 10**9):
+            monkeypatch.setattr(run, "_LONG", least)
+            engine = SwitchingKalmanFilter(merging)
+            compiled += "machine code" in str(
+                bmc.explain(dbn, observations, engine=engine, inputs=inputs)
+            )
+            found.append(bmc.smooth(dbn, observations, inputs=inputs, engine=engine))
+        one, two = found
+        assert off(one.log_marginal_increments, two.log_marginal_increments) < 1e-10
+        for name in one.names:
+            if dbn[name].is_discrete:
+                assert off(one.probabilities(name), two.probabilities(name)) < 1e-10
+            else:
+                assert off(one.mean(name), two.mean(name)) < 1e-10
+                assert off(one.var(name), two.var(name)) < 1e-10
+    assert compiled > len(cases) / 3

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.mutants import chains, densities, draws, exact, filters, hamiltonian, switching
+from tests.mutants import chains, densities, draws, exact, factored, filters, hamiltonian, switching
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -11,6 +11,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *densities.MUTANTS,
 )

@@ -88,3 +88,30 @@ def test_another_function_of_numbers_is_refused() -> None:
     assert isinstance(density(model, "y"), Opaque)
     with pytest.raises(TraceError, match="other values than the function"):
         read_given(model, "y", {"u": np.array(1.0)})
+
+
+def test_nodes_that_are_cut_stay_leaves() -> None:
+    """Gaussian filters have a place for computed nodes of the slice before, and look no further."""
+    net = bmc.BayesNet()
+    net.input("u")
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("twice", lambda x: 2.0 * x)
+    net.add("y", lambda twice, u: bmc.Normal(twice if u > 0 else -twice, 1.0))
+    model = net.model({}, {"u": 1.0})
+    known = {"u": np.array(1.0)}
+    for cut, leaf in ((frozenset(), "x"), (frozenset({"twice"}), "twice")):
+        assert read_given(model, "y", known, cut).parameters["loc"].leaves == {leaf}
+
+
+def test_filters_go_through_computed_nodes_of_functions_that_are_read_with_values() -> None:
+    gains = [np.array([0.5, 2.0])]
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("k", [], [0.5, 0.5])
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("d", lambda x, d_prev: x + 0.5 * d_prev, initial=lambda x: x)
+    dbn.add("y", lambda d, k: bmc.Normal(gains[0][k] * d, 1.0))
+    rows = {"y": [0.5, 1.0, 2.0], "k": [0, 1, 1]}
+    found = bmc.filter(dbn, rows, engine=bmc.KalmanFilter())
+    exact = bmc.infer(dbn, rows, engine=bmc.Exact())
+    np.testing.assert_allclose(found.log_marginal_likelihood, exact.log_marginal_likelihood)
+    np.testing.assert_allclose(found.mean("x")[-1], exact.mean("x[2]"))

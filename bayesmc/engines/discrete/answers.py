@@ -51,7 +51,8 @@ class SliceAnswers:
 
     def hands_on(self, name: str) -> bool:
         """Whether a node is part of the state of a chain."""
-        return any(v[1] == name for c in self.plan.chains for v in c.state)
+        is_kept = any(v[1] == name for c in self.plan.chains for v in c.state)
+        return is_kept and self.run.ties_slices
 
     def pairs(self, name: str) -> np.ndarray:
         """Joint tables of a node and itself in the slice before, (steps - 1, *plates, states, states)."""
@@ -101,11 +102,11 @@ class SliceAnswers:
     # ---- private ----------------------------------------------------------------------------
 
     def _table(self, name: str, node: CompiledNode) -> np.ndarray:
-        alone = (0, name, 0)
-        number = self.plan.chain_of(alone)
-        if self.plan.chains[number].state == (alone,) and node.plates == self.reader.apart:
-            belief = self.run.beliefs[number].belief  # as it stands: long series are not copied
-            return belief.reshape(self.run.steps, *node.plate_shape, -1)
+        alone = self.run.alone((0, name, 0))
+        if alone is not None and node.plates == self.reader.apart:
+            return alone.reshape(
+                self.run.steps, *node.plate_shape, -1
+            )  # long series are not copied
         out = np.empty((self.run.steps, *node.plate_shape, self.reader.card(name)))
         for element in range(self.reader.elements(name)):
             scope = ((0, name, element),)
@@ -220,20 +221,17 @@ class SliceAnswers:
 
     def _stretches(self, scope: Sequence[Variable]) -> list[tuple[int, int]]:
         """Slices cut so that the joint of some variables stays within bounds."""
-        entries = 1.0
-        for number in {self.plan.chain_of(v) for v in scope}:
-            chain = self.plan.chains[number]
-            plain = set(scope) <= set(chain.state)
-            entries = max(entries, float(chain.size) if plain else self.plan.widest[number])
-        return self.run.stretches(entries * self.run.sequences)
+        return self.run.stretches(self.run.entries(scope) * self.run.sequences)
 
     def _cut(self, term: Term, more: float) -> list[tuple[int, int]]:
         """Slices cut so that a term's tables and the joints of what it reads stay within bounds."""
         entries = max(more, math.prod(map(float, self.reader.cards(term))))
-        for _, name in (*term.alone, *term.whole):
-            for element in range(self.reader.elements(name)):
-                number = self.plan.chain_of((0, name, element))
-                entries = max(entries, self.plan.widest[number])
+        reads = (
+            (lag, name, element)
+            for lag, name in (*term.alone, *term.whole)
+            for element in range(self.reader.elements(name))
+        )
+        entries = max(entries, self.run.entries(reads))
         return self.run.stretches(entries * self.run.sequences)
 
     def _check_question(self, term: Term) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Series
@@ -47,8 +49,11 @@ def size_refusal(
     for chain, widest in zip(plan.chains, plan.widest, strict=True):
         names = ", ".join(dict.fromkeys(n for _, n, _ in chain.state))
         if chain.size > max_states:
-            why = f"the joint state of {names} has {chain.size:.3g} values, above max_states={max_states}"
-            return _too_large(why, 8.0 * chain.size)
+            size = math.prod(
+                float(plan.cards[v]) for v in chain.state
+            )  # it may be beyond any float
+            why = f"the joint state of {names} has {size:.3g} values, above max_states={max_states}"
+            return _too_large(why, 8.0 * size)
         total += 8.0 * (4.0 * widest + 3.0 * steps * sequences * chain.size)
         if total > max_bytes:
             why = (
@@ -104,7 +109,9 @@ def is_untold(plan: DiscreteSlices, series: Series, name: str, steps: int | None
 
 def _too_large(why: str, count: float) -> BudgetError:
     return BudgetError(
-        f"DiscreteFilter: {why}; use ParticleFilter(particles)", int(min(count, 2**62))
+        f"DiscreteFilter: {why}; use BoyenKoller() or FactoredFrontier(), whose beliefs are products over "
+        "clusters of nodes or single ones (approximate), or ParticleFilter(particles)",
+        int(min(count, 2**62)),
     )
 
 

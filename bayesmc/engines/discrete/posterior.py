@@ -100,7 +100,29 @@ class Held(NamedTuple):
     before: Sequence[np.ndarray] | None
 
 
-class DiscreteBelief(SliceBelief):
+class FiniteBelief(SliceBelief):
+    """Base of the beliefs of filters of finite nodes, each family's of a class of its own."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        if self.dbn is not None and not self.dbn.template.has_functions:
+            return {**self.__dict__}  # tables alone travel
+        return super().__getstate__()
+
+    def _without_functions(self) -> Held:
+        return Held(self.state.series, self.state.before)
+
+    def _answered(self) -> SeriesPosterior:
+        answers = SliceAnswers(self.state)
+        slices = answers.plan.slices
+        found = answers.of(slices.dynamic)
+        return DiscretePosterior(
+            slices.first, None, "filter", None, tables=found.tables, means=found.means,
+            variances=found.variances, steps=1, start=self.t,
+        ).read_from(answers)  # fmt: skip
+
+
+class DiscreteBelief(FiniteBelief):
     """Probabilities of the nodes of one slice.
 
     Attributes
@@ -122,24 +144,6 @@ class DiscreteBelief(SliceBelief):
     >>> belief.t, belief.probabilities("rain").round(3).tolist()
     (0, [0.182, 0.818])
     """
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
-        if self.dbn is not None and not self.dbn.template.has_functions:
-            return {**self.__dict__}  # tables alone travel
-        return super().__getstate__()
-
-    def _without_functions(self) -> Held:
-        return Held(self.state.series, self.state.before)
-
-    def _answered(self) -> SeriesPosterior:
-        answers = SliceAnswers(self.state)
-        slices = answers.plan.slices
-        found = answers.of(slices.dynamic)
-        return DiscretePosterior(
-            slices.first, None, "filter", None, tables=found.tables, means=found.means,
-            variances=found.variances, steps=1, start=self.t,
-        ).read_from(answers)  # fmt: skip
 
 
 def window(slices: Slices, before: Series | None, row: Row) -> Series:

@@ -6,12 +6,12 @@ that memory holds beliefs and a few stretches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.categorical import log_sum_exp
+from bayesmc.categorical import log_sum_exp, pick
 from bayesmc.dbn import Series
 from bayesmc.engines.discrete.chain import Passed, filtered, lagged, smoothed
 from bayesmc.engines.discrete.rows import Piece, Rows, Variable
@@ -35,6 +35,9 @@ class Run:
     before : list of ndarray, optional
         Logs of the beliefs in the slice before, by chain, shape (sequences, states).
     """
+
+    #: whether it knows joint tables of two slices in a row
+    ties_slices = True
 
     def __init__(
         self,
@@ -78,12 +81,8 @@ class Run:
                 if piece.invalid is not None and piece.invalid.any():
                     row = int(np.argmax(piece.invalid.reshape(len(piece.invalid), -1).any(axis=1)))
                     raise bad_parameters(piece.node, start + row)
-        for number, chain in enumerate(self.plan.chains):
-            last = None if self.before is None else self.before[number]
-            found = filtered(self.blocks(number), self.steps, self.sequences, chain.size, last)
-            increments += found.increments
-            self.passed.append(found)
-        self.beliefs = self.passed
+        for number in range(len(self.plan.chains)):
+            increments += self._passed(number)
         if not (increments > -np.inf).all():
             self._refuse_impossible(increments)
         self._refuse_invalid()
@@ -137,6 +136,41 @@ class Run:
 
     # ---- reading ----------------------------------------------------------------------------
 
+    def last(self) -> Any:
+        """What the slice after the last one goes on from: logs of the beliefs of each chain."""
+        return [p.logs(slice(-1, None))[0] for p in self.passed]
+
+    def alone(self, variable: Variable) -> np.ndarray | None:
+        """Probabilities of a variable, (steps, sequences, states), where they stand by themselves."""
+        number = self.plan.chain_of(variable)
+        if self.plan.chains[number].state != (variable,):
+            return None
+        return self.beliefs[number].belief
+
+    def entries(self, variables: Iterable[Variable]) -> float:
+        """Entries of the largest table of a slice that joint probabilities of variables take."""
+        found, asked = 1.0, set(variables)
+        for number in {self.plan.chain_of(v) for v in asked}:
+            chain = self.plan.chains[number]
+            plain = asked <= set(chain.state)
+            found = max(found, float(chain.size) if plain else self.plan.widest[number])
+        return found
+
+    def drawn(self, at: int, rng: np.random.Generator, count: int) -> dict[Variable, np.ndarray]:
+        """Draws of all that the next slice reads from the filtered belief of slice ``first + at``.
+
+        Each has shape (count, sequences).
+        """
+        found: dict[Variable, np.ndarray] = {}
+        for chain, passed in zip(self.plan.chains, self.passed, strict=True):
+            belief = passed.belief[at]
+            sizes = [self.plan.cards[v] for v in chain.state]
+            flat = pick(belief.T, rng.random((count, len(belief))))
+            if sizes:
+                codes = np.unravel_index(flat, sizes)
+                found.update(zip(chain.state, codes, strict=True))
+        return found
+
     def joint(self, scope: Sequence[Variable], start: int, stop: int) -> np.ndarray:
         """Probabilities of variables in slices of one kind, shape (rows, sequences, *cards)."""
         scope = tuple(scope)
@@ -157,6 +191,19 @@ class Run:
         entries = self.sequences if number is None else self.plan.row_entries[number]
         return self.stretches(float(entries))
 
+    def _passed(self, number: int) -> np.ndarray:
+        """Filter one chain; log densities of its rows, shape (steps, sequences)."""
+        last = None if self.before is None else self.before[number]
+        size = self.plan.chains[number].size
+        found = filtered(self.blocks(number), self.steps, self.sequences, size, last)
+        self.passed.append(found)
+        self.beliefs = self.passed
+        return found.increments
+
+    def _increments(self, number: int) -> np.ndarray:
+        """Log densities of the rows of one chain, shape (steps, sequences)."""
+        return self.passed[number].increments
+
     def _is_of(self, piece: Piece, number: int) -> bool:
         return self.plan.chain_of(piece.scope[0]) == number
 
@@ -172,6 +219,13 @@ class Run:
             out = tuple(2 + k for k, v in enumerate(chain.state) if v not in scope)
             left = tuple(v for v in chain.state if v in scope)
             return aligned(Named(left, shaped.sum(axis=out) if out else shaped), scope)
+        return self._eliminated(number, scope, start, stop)
+
+    def _eliminated(
+        self, number: int, scope: tuple[Variable, ...], start: int, stop: int
+    ) -> np.ndarray:
+        """The joint of some variables of one chain, all others summed out of its slices."""
+        cards = self.plan.cards
         rows = self.plan.rows(self.series, start, stop)
         pieces = [*self.pieces(number, rows), *self._around(number, start, stop)]
         table = summed(pieces, scope, cards, log_sum_exp)
@@ -233,19 +287,26 @@ class Run:
         for piece in self.pieces(None, rows):
             if not (piece.values > -np.inf).all():
                 return piece.node
-        order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
         for number in range(len(self.plan.chains)):
-            if self.passed[number].increments[t - self.first, sequence] > -np.inf:
-                continue
-            pieces = sorted(self.pieces(number, rows), key=lambda p: order[p.node])
-            taken = [p for p in pieces if not p.is_evidence]
-            now = [p for p in self._around(number, t, t + 1) if p.scope and p.scope[0][0] == 1]
-            for piece in (p for p in pieces if p.is_evidence):
-                taken.append(piece)
-                total = summed([*taken, *now], (), self.plan.cards, log_sum_exp)
-                if np.broadcast_to(total, (1, self.sequences))[0, sequence] == -np.inf:
-                    return piece.node
+            if not self._increments(number)[t - self.first, sequence] > -np.inf:
+                node = self._culprit_of(number, t, sequence)
+                if node is not None:
+                    return node
         return self.plan.slices.dynamic[-1]
+
+    def _culprit_of(self, number: int, t: int, sequence: int) -> str | None:
+        """That node of one chain."""
+        rows = self.plan.rows(self.series, t, t + 1)
+        order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
+        pieces = sorted(self.pieces(number, rows), key=lambda p: order[p.node])
+        taken = [p for p in pieces if not p.is_evidence]
+        now = [p for p in self._around(number, t, t + 1) if p.scope and p.scope[0][0] == 1]
+        for piece in (p for p in pieces if p.is_evidence):
+            taken.append(piece)
+            total = summed([*taken, *now], (), self.plan.cards, log_sum_exp)
+            if np.broadcast_to(total, (1, self.sequences))[0, sequence] == -np.inf:
+                return piece.node
+        return None
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.categorical import pick
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.discrete.limits import first_gap
 from bayesmc.engines.discrete.rows import Rows, Term, Variable
@@ -109,7 +108,7 @@ class _Draws:
 
     def __call__(self, rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
         run, plan = self.run, self.run.plan
-        row, states = run.series.row(self.at), self._states(rng, count)
+        row, states = run.series.row(self.at), run.drawn(self.at, rng, count)
         values = {**plan.reader.static, **row.inputs, **{n: s.value for n, s in row.seen.items()}}
         model, found = plan.slices.model(row.t), {}
         for name in (n for n in plan.slices.dynamic if n in plan.reader.variables):
@@ -119,16 +118,4 @@ class _Draws:
             if name not in values:  # computed; of what the slice alone tells, or nothing is said
                 values[name] = model.evaluate(name, values)[0]
             found[name] = values[name]
-        return found
-
-    def _states(self, rng: np.random.Generator, count: int) -> dict[Variable, np.ndarray]:
-        """Of every variable that the next slice reads, shape (count, sequences)."""
-        found: dict[Variable, np.ndarray] = {}
-        for chain, passed in zip(self.run.plan.chains, self.run.passed, strict=True):
-            belief = passed.belief[self.at]
-            sizes = [self.run.plan.cards[v] for v in chain.state]
-            flat = pick(belief.T, rng.random((count, len(belief))))
-            if sizes:
-                codes = np.unravel_index(flat, sizes)
-                found.update(zip(chain.state, codes, strict=True))
         return found

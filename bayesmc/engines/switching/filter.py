@@ -64,7 +64,7 @@ class SwitchingBelief(SliceBelief):
         return self.state.posterior(self.t)
 
     def _without_functions(self) -> SwitchingState:
-        return self.state
+        return self.state._replace(memory=None)
 
 
 @dataclass(frozen=True)
@@ -205,8 +205,9 @@ class SwitchingKalmanFilter(FilterEngine):
         run = self._run(problem)
         pairs = run.stretches[-1].pairs
         filters = len(pairs.dst) if self.merging == "gpb2" else len(pairs.of_kind)
+        how = " in machine code" if run.is_compiled else ""
         return (
-            f"{len(run.now)} modes, {filters} Kalman filters a slice; the log marginal likelihood is an "
+            f"{len(run.now)} modes, {filters} Kalman filters a slice{how}; the log marginal likelihood is an "
             "approximation of unknown error"
         )
 
@@ -273,6 +274,8 @@ class SwitchingKalmanFilter(FilterEngine):
             )
         if self.linearize:
             return f"{why}; use ParticleFilter"
+        if not modes.names:
+            return f"{why}; use ExtendedKalmanFilter or ParticleFilter"
         return f"{why}; use SwitchingKalmanFilter(linearize=True) or ParticleFilter"
 
     # ---- private -------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesmc.linalg.square_root import condition_many
+from bayesmc.lowering import GaussianLoops
 
 
 class Mixture(NamedTuple):
@@ -64,7 +65,9 @@ def shares(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         ]
 
 
-def merged(log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> Mixture:
+def merged(
+    log: np.ndarray, mean: np.ndarray, factor: np.ndarray, loops: GaussianLoops | None = None
+) -> Mixture:
     """One Gaussian for every group.
 
     Parameters
@@ -73,6 +76,8 @@ def merged(log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> Mixture:
     mean : ndarray, shape (groups, members, *lead, n)
     factor : ndarray, shape (groups, members, *lead, n, m)
         Any roots of the covariances.
+    loops : GaussianLoops, optional
+        Machine code, for what has no further axes.
 
     Examples
     --------
@@ -86,6 +91,10 @@ def merged(log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> Mixture:
     n, m, size, ndim = mean.shape[-1], factor.shape[-1], log.shape[1], mean.ndim
     if size == 1 and m == n:
         return Mixture(log[:, 0], mean[:, 0], factor[:, 0])
+    if loops is not None and ndim == 3:
+        found = loops.merged(*map(np.ascontiguousarray, (log, mean, factor)))
+        if found is not None:
+            return Mixture(*found)
     total, share = shares(log)
     centre = np.add.reduce(share[..., None] * mean, axis=1)
     root = np.sqrt(share)[..., None]
@@ -93,5 +102,5 @@ def merged(log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> Mixture:
     behind = (0, *range(2, ndim), 1)  # members stand beside each other
     columns[..., :m] = (root[..., None] * factor).transpose(*behind, ndim)
     columns[..., m] = (root * (mean - centre[:, None])).transpose(behind)
-    found = condition_many(columns.reshape(*centre.shape, size * (m + 1)), 0)
-    return Mixture(total, centre, found.factor[..., :n])
+    made = condition_many(columns.reshape(*centre.shape, size * (m + 1)), 0)
+    return Mixture(total, centre, made.factor[..., :n])

@@ -18,6 +18,7 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.switching.merging import Mixture, merged, shares
 from bayesmc.engines.switching.stretches import Stretch
 from bayesmc.linalg.square_root import Conditioned, condition, condition_many, log_densities
+from bayesmc.lowering import GaussianLoops
 
 
 class Place(NamedTuple):
@@ -54,7 +55,9 @@ def nothing(layout: Layout) -> Mixture:
     return Mixture(np.zeros((1, *lead)), np.zeros((1, *lead, 0)), np.zeros((1, *lead, 0, 0)))
 
 
-def advanced(merging: str, before: Mixture | None, place: Place) -> tuple[Mixture, np.ndarray]:
+def advanced(
+    merging: str, before: Mixture | None, place: Place, loops: GaussianLoops | None = None
+) -> tuple[Mixture, np.ndarray]:
     """The modes of a slice given its row and those before, and the log density of the row.
 
     Parameters
@@ -63,6 +66,8 @@ def advanced(merging: str, before: Mixture | None, place: Place) -> tuple[Mixtur
         "gpb1", "imm" or "gpb2".
     before : Mixture or None
         Of the modes of the slice before, normalised; None in slice 0.
+    loops : GaussianLoops, optional
+        Machine code for it.
 
     Returns
     -------
@@ -74,14 +79,16 @@ def advanced(merging: str, before: Mixture | None, place: Place) -> tuple[Mixtur
     """
     pairs = place.stretch.pairs
     by_kind = merging != "gpb2" or len(pairs.of_kind) == len(pairs.dst)
-    ahead = _ahead(merging, before, place)
-    taken = _taken(place, by_kind, ahead.mean, ahead.factor)
+    ahead = _ahead(merging, before, place, loops)
+    taken = _quickly(place, by_kind, ahead, loops) or _taken(
+        place, by_kind, ahead.mean, ahead.factor
+    )
     by_dst = pairs.kinds_by_dst if by_kind else pairs.by_dst
     log = by_dst.logs(ahead.log + taken.log)
     if by_dst.are_single:
         found = Mixture(log[:, 0], taken.mean, taken.factor)
     else:
-        found = merged(log, by_dst.of(taken.mean), by_dst.of(taken.factor))
+        found = merged(log, by_dst.of(taken.mean), by_dst.of(taken.factor), loops)
     top = np.maximum.reduce(found.log, axis=0)
     if np.minimum.reduce(top, axis=None) == -np.inf:
         return found, np.where(top > -np.inf, top, -np.inf)
@@ -99,16 +106,16 @@ class Taken(NamedTuple):
     factor : ndarray, shape (size, *lead, kept, kept)
     log : ndarray, shape (size, *lead)
         Log densities of the row.
-    made : Conditioned
-    eta : ndarray, shape (size, *lead, observed)
-        Standardised innovations.
+    made : Conditioned or None
+        What smoothers need, and with it standardised innovations, shape (size, *lead, observed).
+    eta : ndarray or None
     """
 
     mean: np.ndarray
     factor: np.ndarray
     log: np.ndarray
-    made: Conditioned
-    eta: np.ndarray
+    made: Conditioned | None = None
+    eta: np.ndarray | None = None
 
 
 def _taken(
@@ -132,6 +139,24 @@ def _taken(
     after = after[..., pattern.kept - layout.p]
     wide = np.broadcast_to(made.factor, (*after.shape, after.shape[-1]))
     return Taken(after, wide, log, made, eta)
+
+
+def _quickly(
+    place: Place, by_kind: bool, ahead: Mixture, loops: GaussianLoops | None
+) -> Taken | None:
+    """The same in machine code, where it can be had."""
+    stretch, pattern = place.stretch, place.pattern
+    if loops is None or stretch.is_singular or pattern.absent is not None or ahead.log.ndim > 1:
+        return None
+    given = stretch.coefficients(place.at, pattern, by_kind)
+    found = None
+    if given.is_wide:
+        mean, factor = np.ascontiguousarray(ahead.mean), np.ascontiguousarray(ahead.factor)
+        found = loops.conditioned(given, mean, factor, np.ascontiguousarray(place.row))
+    if found is None:  # what is known without noise is so in most slices
+        stretch.is_singular = True
+        return None
+    return Taken(*found)
 
 
 def whole(place: Place, found: Mixture) -> Mixture:
@@ -185,7 +210,7 @@ def turned_back(before: Mixture, place: Place) -> Back:
     found = _taken(place, False, start.mean[pairs.src], start.factor[pairs.src], True)
     p, carried = len(pattern.observed), place.layout.carried
     after = whole(place, Mixture(log, found.mean, found.factor)).first(carried)
-    assert found.made.turn is not None
+    assert found.made is not None and found.eta is not None and found.made.turn is not None
     turn = np.broadcast_to(found.made.turn, (*log.shape, *found.made.turn.shape[-2:]))
     return Back(
         log,
@@ -249,7 +274,9 @@ def smoothed(back: Back, place: Place, filtered: Mixture, later: Smoothed) -> Sm
 _NOTHING = 1e-10
 
 
-def _ahead(merging: str, before: Mixture | None, place: Place) -> Mixture:
+def _ahead(
+    merging: str, before: Mixture | None, place: Place, loops: GaussianLoops | None
+) -> Mixture:
     """Gaussians to take through a slice, with their weights there; of kinds, or under GPB2 of pairs."""
     stretch = place.stretch
     pairs, log = stretch.pairs, stretch.log_of(place.at)
@@ -270,8 +297,8 @@ def _ahead(merging: str, before: Mixture | None, place: Place) -> Mixture:
     groups = pairs.by_kind
     if merging == "imm":
         at = pairs.src[groups.members]
-        return merged(groups.logs(log), start.mean[at], start.factor[at])
-    one = merged(start.log[None], start.mean[None], start.factor[None])
+        return merged(groups.logs(log), start.mean[at], start.factor[at], loops)
+    one = merged(start.log[None], start.mean[None], start.factor[None], loops)
     kinds = len(pairs.of_kind)
     total, _ = shares(groups.logs(log))
     return Mixture(total, np.repeat(one.mean, kinds, axis=0), np.repeat(one.factor, kinds, axis=0))

@@ -14,6 +14,8 @@ from bayesmc.engines.filtering import pass_slices
 from bayesmc.engines.kalman.covariances import by_pattern
 from bayesmc.engines.kalman.data import Pattern, SeriesData, given_values, pattern_of, stacked
 from bayesmc.engines.kalman.levels import Rule
+from bayesmc.engines.kalman.passes import Memory
+from bayesmc.engines.kalman.reading import reads_time
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.switching.merging import Mixture
 from bayesmc.engines.switching.modes import Modes
@@ -30,7 +32,11 @@ from bayesmc.engines.switching.passes import (
 from bayesmc.engines.switching.posterior import Beliefs, SwitchingSeries, answers, by_modes
 from bayesmc.engines.switching.stretches import Stretch
 from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityError
+from bayesmc.lowering import gaussian_loops, is_available
 from bayesmc.network import Observed
+
+#: slices from which on machine code is loaded
+_LONG = 300
 
 
 class Options(NamedTuple):
@@ -78,13 +84,14 @@ class SwitchingRun:
     def forward(self, advance: Callable[[], None]) -> tuple[list[Mixture], np.ndarray]:
         """Mixtures over modes of every slice given the rows up to it, and log densities of the rows."""
         data, merging = self.data, self.options.merging
+        loops = gaussian_loops() if self.is_compiled else None
         found: list[Mixture] = []
         increments = np.empty((data.steps, *data.layouts[0].lead))
         places = self.places
 
         def move(k: int) -> None:
             place = places[k]
-            after, increments[k] = advanced(merging, found[-1] if found else None, place)
+            after, increments[k] = advanced(merging, found[-1] if found else None, place, loops)
             check_row(data.series.start + k, increments[k])
             found.append(after if k else self._over_all(after))
 
@@ -180,6 +187,12 @@ class SwitchingRun:
             self.options.engine, beliefs, kind, increments, told, seen, series.start, queries
         )  # fmt: skip
 
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there is machine code for it, and enough to do."""
+        plain = self.options.rule is None and not self.data.layouts[0].lead
+        return plain and self.data.steps >= _LONG and is_available()
+
     @cached_property
     def told(self) -> dict[str, tuple[Any, Any]]:
         """See ``posterior.by_modes``."""
@@ -221,6 +234,8 @@ class SwitchingState(NamedTuple):
     told : dict
         See ``by_modes``.
     observed : dict
+    memory : Memory or None
+        None out of a pickle.
     """
 
     modes: Modes
@@ -230,6 +245,7 @@ class SwitchingState(NamedTuple):
     known: dict[str, np.ndarray]
     told: dict[str, tuple[Any, Any]]
     observed: dict[str, Observed]
+    memory: Memory | None
 
     def posterior(self, t: int) -> SwitchingSeries:
         """Answers about this slice."""
@@ -253,6 +269,8 @@ def row_taken(
 ) -> tuple[SwitchingState, np.ndarray]:
     """The slice after ``before``, and the log density of its row.
 
+    What rows of the same kind share is worked out once.
+
     Raises
     ------
     UnsupportedError, ParameterError, DegeneracyError, ZeroProbabilityError
@@ -260,8 +278,13 @@ def row_taken(
     mine = {*modes.names, *modes.leaves}
     seen = frozenset(n for n, o in row.seen.items() if o.mask is None) - mine
     carried = () if before is None else before.layout.after
-    unknown = unknown_nodes(slices, before is None, modes.known(seen), carried)
-    layout = Layout(slices, modes.apart, before is None, carried, unknown)
+    memory = Memory() if before is None or before.memory is None else before.memory
+
+    def lay_out() -> Layout:
+        unknown = unknown_nodes(slices, before is None, modes.known(seen), carried)
+        return Layout(slices, modes.apart, before is None, carried, unknown)
+
+    layout = memory((before is None, carried, seen), lay_out)
     values = {**row.inputs, **{n: row.seen[n].value for n in seen}}
     if before is not None:
         values |= {n + PREVIOUS: v for n, v in before.known.items()}
@@ -272,14 +295,21 @@ def row_taken(
         if n in mine
     }
     some = np.zeros((), dtype=np.intp)
-    possible = {**static, **values, **modes.at(some)}
-    why = options.engine.refused_slice(modes, layout, possible | modes.at(some, PREVIOUS))
+    possible = {**static, **values, **modes.at(some), **modes.at(some, PREVIOUS)}
+    why = memory(
+        (layout, options.engine), lambda: options.engine.refused_slice(modes, layout, possible)
+    )
     if why is not None:
         raise UnsupportedError(f"{type(options.engine).__name__}: {why}")
-    configurations = None if before is None else before.now
-    stretch = Stretch(
-        layout, modes, {**static, **timed}, observed, 1, configurations, rule=options.rule
-    )
+    there = None if before is None else before.now
+
+    def make() -> tuple[Stretch, dict[str, tuple[Any, Any]]]:
+        found = Stretch(layout, modes, {**static, **timed}, observed, 1, there, rule=options.rule)
+        return found, by_modes([found], found.pairs.now)
+
+    still = not observed and _is_still(modes, layout)
+    key = layout, options.engine, None if there is None else there.tobytes()
+    stretch, told = memory(key, make) if still else make()
     _check_count(len(stretch.pairs.now), options)
     partly = {n: o for n, o in row.seen.items() if n not in seen and n not in mine}
     found = given_values(layout, partly, ())
@@ -295,8 +325,7 @@ def row_taken(
     known = {n: row.seen[n].value for n in seen}
     plain = (n for n in layout.computed if n not in modes.names and not _of_modes(modes, layout, n))
     known |= {n: _evaluated(layout, n, {**static, **values}) for n in plain}
-    told = by_modes([stretch], stretch.pairs.now)
-    state = SwitchingState(modes, stretch.pairs.now, after, layout, known, told, observed)
+    state = SwitchingState(modes, stretch.pairs.now, after, layout, known, told, observed, memory)
     return state, increment
 
 
@@ -358,6 +387,13 @@ def _with_given(
     if given is None or len(pattern.observed) == layout.p:
         return row
     return np.concatenate([row, given[..., pattern.observed[layout.p :] - layout.p]], axis=-1)
+
+
+def _is_still(modes: Modes, layout: Layout) -> bool:
+    """Whether modes and coefficients are the same in all rows that see the same nodes."""
+    given = {*modes.names, *modes.leaves}
+    known = {*given, *(n + PREVIOUS for n in modes.names), *layout.computed}
+    return set(layout.certain) <= given and not reads_time(layout, known)
 
 
 def _of_modes(modes: Modes, layout: Layout, name: str) -> bool:

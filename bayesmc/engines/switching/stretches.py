@@ -24,6 +24,7 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.switching.modes import Modes
 from bayesmc.engines.switching.pairs import Pairs
 from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.lowering import Coefficients
 from bayesmc.network import Observed
 from bayesmc.network.forward import summed
 from bayesmc.network.model import invalid_error
@@ -81,6 +82,8 @@ class Stretch:
         self.count = count
         self._memory = Memory()
         self._plan: Plan | None = None
+        #: whether some row was met that machine code leaves to NumPy
+        self.is_singular = rule is not None
         every = np.arange(modes.count) if now is None else now
         table = self._table(observed, before, every)
         possible: np.ndarray = (table > -np.inf).reshape(*table.shape[:3], -1).any(axis=(0, 3))  # type: ignore[assignment]
@@ -113,24 +116,11 @@ class Stretch:
         """
         if self.rule is not None:
             return self._made_linear(k, pattern, by_kind, mean, factor)
-        timeless = len(self.linear.moves) == 1
-
-        def choose() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            """Offset, moves, and rows in which those on the numbers before are still to come."""
-            at, chosen = 0 if timeless else k, pattern.chosen
-            offset, moves, noise = (a[at] for a in self.linear)
-            found = [offset[..., chosen], moves[..., chosen, :], noise[..., chosen, :]]
-            if not by_kind:
-                found = [a.take(self.pairs.kind, axis=0) for a in found]
-            rows = np.zeros((*found[0].shape, c + noise.shape[-1]))
-            rows[..., c:] = found[2]
-            return found[0], found[1], rows
-
+        offset, moves, noise = self.chosen(k, pattern, by_kind)
         c = mean.shape[-1]
-        key = ("chosen", id(pattern), by_kind)
-        offset, moves, rows = self._memory(key, choose) if timeless else choose()
-        rows = rows.copy()
+        rows = np.empty((*mean.shape[:-1], offset.shape[-1], c + noise.shape[-1]))
         np.matmul(moves, factor, out=rows[..., :c])
+        rows[..., c:] = noise
         if pattern.absent is not None:
             rows = without_absent(rows, pattern.absent)
 
@@ -138,6 +128,31 @@ class Stretch:
             return np.abs(offset) + np.matvec(np.abs(moves), np.abs(mean))
 
         return Expected(offset + np.matvec(moves, mean), rows, terms)
+
+    def chosen(self, k: int, pattern: Pattern, by_kind: bool) -> Linear:
+        """Coefficients of the k-th slice, of the numbers that a pattern chooses, for kinds or for pairs."""
+        timeless = len(self.linear.moves) == 1
+
+        def choose() -> Linear:
+            at, chosen = 0 if timeless else k, pattern.chosen
+            offset, moves, noise = (a[at] for a in self.linear)
+            found = [offset[..., chosen], moves[..., chosen, :], noise[..., chosen, :]]
+            if not by_kind:
+                found = [a.take(self.pairs.kind, axis=0) for a in found]
+            return Linear(*found)
+
+        return self._memory((id(pattern), by_kind), choose) if timeless else choose()
+
+    def coefficients(self, k: int, pattern: Pattern, by_kind: bool) -> Coefficients:
+        """The same as machine code reads them."""
+
+        def choose() -> Coefficients:
+            offset, moves, noise = self.chosen(k, pattern, by_kind)
+            return Coefficients(moves, noise, offset)
+
+        if len(self.linear.moves) > 1:
+            return choose()
+        return self._memory(("coefficients", id(pattern), by_kind), choose)
 
     @cached_property
     def linear(self) -> Linear:
