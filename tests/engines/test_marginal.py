@@ -289,7 +289,7 @@ def test_names_say_what_is_integrated_out() -> None:
         (["y"], "'y', and that node is not hidden"),
         (["z"], "names 'z', which is no node of a slice"),
     ):
-        reason = bmc.ParticleFilter(5, marginalize=names).unsupported(dbn, ROWS)
+        reason = bmc.ParticleFilter(5, marginalize=names).unsupported(dbn, {"y": [0.3, 1.2]})
         assert reason is not None and what in reason, (names, reason)
     reason = bmc.ParticleFilter(5, marginalize=["s"]).unsupported(switching(), ROWS)
     assert reason is not None and "finitely many states" in reason

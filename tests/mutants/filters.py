@@ -209,7 +209,7 @@ def after_pickle(engine: Any, rows: list[float] | None, runs: int) -> Test:
 MUTANTS = [
     Mutant(
         "a belief out of a pickle forgets the evidence so far",
-        (Edit("bayesmc.engines.particles.filter:ParticleFilter._bound",
+        (Edit("bayesmc.engines.particles.belief:bound",
               "belief.log_marginal_likelihood,", "0.0,"),),
         after_pickle(bmc.ParticleFilter(200), MILD["y"], 100),
         "repeated_test, 100 runs of 200 particles",

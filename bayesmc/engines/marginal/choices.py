@@ -98,7 +98,7 @@ class Choices:
             log, made = self._worked_out(values, None, row, reader)
             return log, Coefficients(*made, None)
         key = kinds.codes.tobytes()
-        found = None if reader.changing(values, reader.needed) else self._kept.get(key)
+        found = None if self._changes(values, row, reader) else self._kept.get(key)
         if found is None:
             found = self._worked_out(values, kinds.of_kind, row, reader)
             if len(self._kept) >= _KEPT:
@@ -132,6 +132,11 @@ class Choices:
         return found
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _changes(self, values: Values, row: Row, reader: SliceReader) -> bool:
+        """Whether anything is read, or seen of a node with a value, that other slices have otherwise."""
+        seen = any(name in row.seen for name in self.layout.certain)
+        return seen or reader.changing(values, reader.needed)
 
     def _worked_out(
         self, values: Values, which: np.ndarray | None, row: Row, reader: SliceReader

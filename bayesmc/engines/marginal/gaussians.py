@@ -71,6 +71,10 @@ class Gaussians(NamedTuple):
         """Every particle's own, shape (particles, *lead, n, m)."""
         return self.factors if self.which is None else self.factors.take(self.which, axis=0)
 
+    def has(self, name: str) -> bool:
+        """Whether there is a belief about a node."""
+        return name in self.layout.rows
+
     def joined(self, parties: Sequence[Any], at: np.ndarray) -> Gaussians:
         """Some of those of several parties, one after the other."""
         means = np.concatenate([p.inner.mean for p in parties])
@@ -217,9 +221,9 @@ def take_in(
     mean = _expected(before.mean, offset, moves, found.kind)
     own = made
     if group is not None and len(made.root) > 1:
-        arrays = (made.root, made.gain, made.factor, made.turn, made.certain)
-        parts = [a if k == 2 or a is None else a.take(group, axis=0) for k, a in enumerate(arrays)]
-        own = Conditioned(*parts)
+        certain = None if made.certain is None else made.certain.take(group, axis=0)
+        root, gain = made.root.take(group, axis=0), made.gain.take(group, axis=0)
+        own = Conditioned(root, gain, made.factor, None, certain)
     terms = _sizes(before.mean, offset, moves, found.kind)
     after, _, log = absorbed(layout, pattern, own, mean, row, given, terms=terms)
     factors = full_factor(layout, pattern, made.factor)

@@ -14,11 +14,6 @@ from bayesmc.network import CompiledNode
 _POINT = 1e-13
 
 
-def is_integrated(inner: Gaussians | None, name: str) -> bool:
-    """Whether particles have a Gaussian belief about a node."""
-    return inner is not None and name in inner.layout.rows
-
-
 def mixture_quantiles(
     inner: Gaussians, node: CompiledNode, weights: np.ndarray, levels: np.ndarray
 ) -> np.ndarray:

@@ -206,7 +206,7 @@ class _Search:
     def _given_up(self, inner: set[str], name: str) -> tuple[str, ...]:
         """What is sampled so that a node is linear-Gaussian in the rest: the fewest numbers."""
         above = sorted(self._above((name,), inner), key=self.slices.dynamic.index)
-        ways = [(n,) for n in above]
+        ways: list[tuple[str, ...]] = [(n,) for n in above]
         if len(above) > 1:
             ways.append(tuple(above))
         if name in inner:

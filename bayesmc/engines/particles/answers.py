@@ -9,11 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.engines.averages import as_event, called
-from bayesmc.engines.marginal.mixtures import (
-    covariance_within,
-    is_integrated,
-    mixture_quantiles,
-)
+from bayesmc.engines.marginal.mixtures import covariance_within, mixture_quantiles
 from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors
 from bayesmc.engines.particles.families import Families
@@ -93,8 +89,9 @@ class Answers(NamedTuple):
 
     def _means(self, particles: Particles, node: CompiledNode) -> np.ndarray:
         """The same; of what is integrated out each particle's own mean."""
-        if is_integrated(particles.inner, node.name):
-            return particles.inner.mean_of(node)  # type: ignore[no-any-return]
+        inner = particles.inner
+        if inner is not None and inner.has(node.name):
+            return np.asarray(inner.mean_of(node))
         return self._numbers(particles, node)
 
     def _quantiles(self, now: Particles, node: CompiledNode, levels: Any) -> np.ndarray:
@@ -109,7 +106,7 @@ class Answers(NamedTuple):
             shape[1 + axis] = size
         weights = now.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
         weights = np.broadcast_to(weights, numbers.shape)
-        if is_integrated(now.inner, node.name):
+        if now.inner is not None and now.inner.has(node.name):
             return mixture_quantiles(now.inner, node, weights, levels)
         return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
 

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.marginal.mixtures import is_integrated
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import circular_variance
@@ -209,7 +208,8 @@ class Block:
         np.subtract(rows, mean[..., None], out=off)
         np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
-        if is_integrated(self.slices[0].inner, node.name):
+        inner = self.slices[0].inner
+        if inner is not None and inner.has(node.name):
             inside = [p.inner.moments_of(node)[1] for p in self.slices]
             variance += self.weighted(self.turned(inside, self._axes(node)))
         if angles is not None:
@@ -284,8 +284,8 @@ def diagnosed(slices: Sequence[Figures], lead: tuple[int, ...]) -> dict[str, np.
 
 def _values(particles: Particles, node: CompiledNode) -> np.ndarray:
     """What a mean is taken over: of what is integrated out, every particle's own mean."""
-    if is_integrated(particles.inner, node.name):
-        return particles.inner.moments_of(node)[0]  # type: ignore[no-any-return]
+    if particles.inner is not None and particles.inner.has(node.name):
+        return particles.inner.moments_of(node)[0]
     return particles.values[node.name]
 
 

@@ -10,15 +10,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.marginal import options as marginal
-from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.marginal.step import MarginalStep
+from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
+from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
-from bayesmc.engines.particles.making import made_step
+from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
     BUDGET,
     NOT_SMOOTHED,
@@ -41,16 +43,16 @@ from bayesmc.engines.particles.options import (
     uncertain,
     warn_of_a_lonely_step,
     warn_of_what_is_not_guided,
+    without_functions,
 )
 from bayesmc.engines.particles.record import FilteredParticles, filtered_by
 from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.particles.smc import quiet
+from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
 from bayesmc.engines.particles.smoothing import Backwards, backwards, by_lag
-from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.slice_steps import SliceProposals, plates_apart
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
-from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
-from bayesmc.resampling import scheme_of
+from bayesmc.randomness import seed_sequence
+from bayesmc.resampling import Adaptive, checked, scheme_of
 from bayesmc.results.predictive import warn_of_misfit
 
 #: options that hold functions by node
@@ -198,25 +200,14 @@ class ParticleFilter(FilterEngine):
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
         check_kind("adapt", self.adapt, KLD)
         check_kind("recovery", self.recovery, Recovery)
-        if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
-            raise TypeError(
-                f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
-                "log factors"
-            )
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
         check_together(self)
-        object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
+        if self.marginalize is not None:
+            object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions."""
-        state = dict(self.__dict__)
-        for option in _FUNCTIONS:
-            if isinstance(state[option], Mapping):
-                state[option] = dict.fromkeys(state[option])
-        for option in ("resampling", "auxiliary"):
-            state[option] = None if callable(state[option]) else state[option]
-        return state
+        return without_functions(self, _FUNCTIONS)
 
     def __copy__(self) -> ParticleFilter:
         return self
@@ -241,12 +232,13 @@ class ParticleFilter(FilterEngine):
         if common is not None:
             return common
         asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
-        return marginal.why_not(self, problem, asked) or refused(self, problem, asked)
+        why = None if self.marginalize is None else marginal.why_not(self, problem, asked)
+        return refused(self, problem, asked) if why is None else why
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if asked.what == "fixed-lag" and marginal.split_of_problem(self, problem):
+        if asked.what == "fixed-lag" and self._integrates(problem):
             return marginal.NOT_LAGGED
         sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
@@ -256,7 +248,7 @@ class ParticleFilter(FilterEngine):
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
-        if marginal.split_of_problem(self, problem):
+        if self._integrates(problem):
             return marginal.told(self, problem, found)
         return found | looks_told(self, problem, found)
 
@@ -304,18 +296,14 @@ class ParticleFilter(FilterEngine):
             what = "or None for as many as there are particles, 1,000 at most"
             check_count("trajectories", trajectories, what, "smooth")
         check_choice("backward", backward, "rejection", "exact", "smooth")
-        if self.adapt is not None or self.recovery is not None:
-            raise UnsupportedError(NOT_SMOOTHED)
+        why = self.unable(problem, Asked("smooth" if lag is None else "fixed-lag"))
+        if why is not None:
+            raise UnsupportedError(why)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
-        if lag is not None and marginal.split_of_problem(self, problem):
-            raise UnsupportedError(marginal.NOT_LAGGED)
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
         else:
-            sums = endless(problem.slices, problem.seen)
-            if sums:
-                raise UnsupportedError(not_backwards(sums[0]))
             asked = Backwards(trajectories, backward == "rejection")
             found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
         self._warn(filtered)
@@ -334,7 +322,36 @@ class ParticleFilter(FilterEngine):
         ``seen`` are nodes that are seen in full in every slice.
         """
         self._require_functions()
-        return made_step(self, slices, static, kept, seen)
+        scheme: Any = scheme_of(self.resampling)
+        threshold = float(self.ess_threshold)
+        if isinstance(scheme, Adaptive):
+            scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
+        apart, count = plates_apart(slices), self.particles
+        assert count is not None
+        is_optimal = isinstance(self.proposal, str)
+        asked = None if is_optimal else self._proposals(slices)
+        if self.marginalize is not None:
+            split = marginal.split_asked(self, slices, static, seen)
+            if split is not None:
+                plan = SlicePlan(slices, apart, static)
+                return MarginalStep(plan, split, count, checked(scheme), threshold, kept, asked)
+        plan = (
+            OptimalPlan(slices, apart, static)
+            if is_optimal
+            else SlicePlan(slices, apart, static, asked)
+        )
+        stage: Any = None
+        if callable(self.auxiliary):
+            stage = GivenStage(plan, self.auxiliary, count)
+        elif self.auxiliary:
+            stage = PluggedIn(plan, count)
+        renewed = None if self.rejuvenation is None else Rejuvenation(plan, self.rejuvenation)
+        recovery: Recovery | None = self.recovery
+        injection = None if recovery is None else Injection(plan, recovery)
+        wanted = kept if kept is None or self.adapt is None else [*kept, *self.adapt.widths]
+        return FilterStep(
+            plan, count, checked(scheme), threshold, stage, renewed, wanted, self.adapt, injection
+        )
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
         return ParticleBelief(dbn, seed_sequence(rng), static)
@@ -342,42 +359,16 @@ class ParticleFilter(FilterEngine):
     def _bound(
         self, belief: ParticleBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> ParticleBelief:
-        held, sized = len(belief.weights), self._sized(START)
-        most = sized.particles
-        assert most is not None
-        if held > most or (held < most and self.adapt is None):
-            raise ValueError(
-                f"ParticleFilter({most}).start: the belief has {held} particles; go on with the "
-                "engine that it was started with"
-            )
-        inner = None if belief.now is None else belief.now.inner
-        seen = () if inner is None else inner.seen
-        step = sized.step_of(slices, read_static(slices, belief.static), seen=seen)
-        return ParticleBelief(
-            dbn, belief.seed, belief.static, step, belief.now,
-            belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
-        )  # fmt: skip
+        return bound(self._sized(START), belief, dbn, slices)
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
-        step, tracker = belief.made_by, belief.tracker
-        if not isinstance(step, FilterStep):
-            full = [n for n, o in row.seen.items() if o.mask is None]
-            step = self._sized(START).step_of(slices, read_static(slices, belief.static), seen=full)
+        if not isinstance(belief.made_by, FilterStep):
             warn_of_what_is_not_guided(self, slices, row.seen)
-        tracker = Tracker(step) if tracker is None else tracker
-        chance = belief.chance
-        rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
-        with quiet():
-            now = step(belief.now, row, rng)
-            families = tracker.after_one(belief.families, belief.now, now, row)
+        found = absorbed(self._sized(START), belief, slices, row)
         if self.particles is None:
-            warn_of_a_lonely_step(belief.now, belief.families, now)
-        total = belief.log_marginal_likelihood + now.increment
-        return ParticleBelief(
-            belief.dbn, belief.seed, belief.static, step, now,
-            total if np.ndim(total) else float(total), rng.bit_generator.state,
-            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
-        )  # fmt: skip
+            assert found.now is not None
+            warn_of_a_lonely_step(belief.now, belief.families, found.now)
+        return found
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -397,6 +388,10 @@ class ParticleFilter(FilterEngine):
         if not step.integrated:
             step = compiled_step(step, problem.steps, self.resampling == "systematic")
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
+
+    def _integrates(self, problem: SeriesProblem) -> bool:
+        """Whether anything is integrated out."""
+        return self.marginalize is not None and bool(marginal.split_of_problem(self, problem))
 
     def _sized(self, particles: int) -> ParticleFilter:
         """The same filter with so many particles, where their number was left out."""
