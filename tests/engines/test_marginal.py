@@ -421,6 +421,56 @@ def test_rows_one_by_one_are_the_run_over_the_series() -> None:
     assert belief.particles("x").shape == (3000,)
 
 
+def landmarks() -> bmc.DynamicBayesNet:
+    """A robot that drives and turns, and sees where landmarks are from where it is."""
+    dbn = bmc.DynamicBayesNet(plates={"mark": 4})
+    push = np.array([0.5, 0.0, 0.1])
+    dbn.add(
+        "pose",
+        lambda pose_prev: bmc.MvNormal(pose_prev + push, np.diag([0.01, 0.01, 0.002])),
+        initial=bmc.MvNormal(np.zeros(3), 1e-4 * np.eye(3)),
+    )
+    dbn.add(
+        "mark",
+        lambda mark_prev: bmc.MvNormal(mark_prev, 1e-4 * np.eye(2)),
+        plates="mark",
+        initial=bmc.MvNormal(np.zeros(2), 9.0 * np.eye(2)),
+    )
+
+    def from_there(mark: Any, pose: Any) -> bmc.MvNormal:
+        c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+        x, y = mark[..., 0] - pose[..., 0], mark[..., 1] - pose[..., 1]
+        return bmc.MvNormal(bmc.stack([c * x + s * y, c * y - s * x], axis=-1), 0.04 * np.eye(2))
+
+    dbn.add("seen", from_there, plates="mark")
+    return dbn
+
+
+def test_a_plate_of_landmarks_is_a_plate_of_small_filters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same as one large Gaussian for each particle, whatever is asked, to rounding."""
+    rng = np.random.default_rng(3)
+    rows = np.array(landmarks().sample(6, rng=1)["seen"][0])
+    rows[rng.random(rows.shape[:2]) < 0.4] = np.nan
+    engine = bmc.ParticleFilter(60, marginalize="auto")
+    nodes = told(landmarks(), {"seen": rows}, engine)
+    assert (
+        nodes["mark"] == "integrated out, a Kalman filter for each particle and element of 'mark'"
+    )
+    answers = []
+    for is_joint in (False, True):
+        if is_joint:
+            monkeypatch.setattr("bayesmc.engines.marginal.step.blocks_of", lambda *given: ())
+        found = bmc.filter(landmarks(), {"seen": rows}, engine=engine, rng=1, keep="particles")
+        assert found.clouds is not None
+        assert found.clouds[-1].inner.factors.ndim == (3 if is_joint else 4)
+        answers.append(
+            (found.log_marginal_increments, found.mean("mark"), found.var("mark"), found.mcse("mark"),
+             found.cov("mark"), found.cov("pose", "mark"), found.quantile("mark", [0.3]))
+        )  # fmt: skip
+    for one, two in zip(*answers, strict=True):
+        assert off(one, two) < 1e-9
+
+
 # ---- refusals -----------------------------------------------------------------------------------
 
 

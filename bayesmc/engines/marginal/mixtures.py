@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -32,25 +33,35 @@ def mixture_quantiles(
     return found.reshape(*levels.shape, *found.shape[1:])
 
 
-def covariance_within(inner: Gaussians, sizes: Mapping[str, int], shares: np.ndarray) -> np.ndarray:
+def covariance_within(
+    inner: Gaussians, nodes: Sequence[CompiledNode], shares: np.ndarray
+) -> np.ndarray:
     """Mean of the particles' covariances of nodes one after the other; 0 for what they know.
 
-    Parameters
-    ----------
-    sizes : dict
-        Node -> how many numbers it has.
-    shares : ndarray, shape (particles,)
-        Normalised weights.
+    ``shares`` are normalised weights, shape ``(particles,)``.
     """
-    m = inner.factors.shape[-1]
-    parts = [
-        inner.factors[:, inner.layout.rows[name]]
-        if name in inner.layout.rows
-        else np.zeros((len(inner.factors), size, m))
-        for name, size in sizes.items()
-    ]
-    rows = np.concatenate(parts, axis=1)
+    layout = inner.layout
+    elements = math.prod(layout.lead)
+    rows = inner.factors.reshape(-1, elements, *inner.factors.shape[-2:])
     if inner.which is not None:
         shares = np.bincount(inner.which, shares, len(rows))
-    columns = (rows * np.sqrt(shares)[:, None, None]).transpose(1, 0, 2).reshape(rows.shape[1], -1)
-    return columns @ columns.T
+    parts: list[np.ndarray] = []
+    at: list[np.ndarray] = []
+    low = 0
+    for node in nodes:
+        size = math.prod(node.value_shape)
+        if inner.has(node.name):
+            own = rows[:, :, layout.rows[node.name]].transpose(2, 1, 3, 0)
+            places = layout.packed(node, np.arange(size).reshape(node.value_shape))
+            parts.append(own)
+            at.append(low + places.reshape(elements, -1).T)
+        low += size
+    whole = np.zeros((low, low))
+    if not parts:
+        return whole
+    columns = np.concatenate(parts) * np.sqrt(shares)
+    places = np.concatenate(at)
+    for e in range(elements):
+        own = columns[:, e].reshape(len(columns), -1)
+        whole[np.ix_(places[:, e], places[:, e])] = own @ own.T
+    return whole

@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
 from bayesmc.engines.marginal.choices import MOST
-from bayesmc.engines.marginal.split import AUTO, Split, split_of
+from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
@@ -132,9 +132,12 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
     if split is None:
         return found
     slices = problem.slices
+    each = "a Kalman filter for each particle"
+    if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
+        each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
     for name in slices.dynamic:
         if name in split.inner:
-            found[name] = "integrated out, a Kalman filter for each particle"
+            found[name] = f"integrated out, {each}"
             if name in problem.series.observed:
                 found[name] = f"{_SEEN}; integrated out where it is missing"
         elif name in split.below:

@@ -30,7 +30,7 @@ class MarginalScouting(Scouting):
     Parameters
     ----------
     step : MarginalStep
-        Whose sampled nodes are finite: otherwise nobody is sent.
+        Whose sampled nodes are finite, with one Gaussian for each particle: otherwise nobody is sent.
     """
 
     def __init__(self, step: Any) -> None:
@@ -38,7 +38,7 @@ class MarginalScouting(Scouting):
         self.step = step
         inner = step.integrated | step.split.seen
         sampled = [n for n in step.slices.stochastic if n not in inner]
-        if any(step.slices.later[n].domain is None for n in sampled):
+        if step.blocks or any(step.slices.later[n].domain is None for n in sampled):
             self.nodes = ()
         self.nodes = tuple(n for n in self.nodes if n.name in sampled)
         self._choices: dict[int, Choices] = {}

@@ -73,6 +73,37 @@ def split_of(
     return kept[key]
 
 
+def blocks_of(slices: Slices, split: Split) -> tuple[str, ...]:
+    """Plates whose elements never meet given what is sampled: each has a Gaussian of its own.
+
+    All that depends on what is integrated out lives in them, and reads its own element of it.
+    """
+    layouts = layouts_of(slices, split.inner, ())
+    placed = {n for layout in layouts for n in (*layout.placed, *layout.silent)}
+    some = next(iter(placed))
+    found = [
+        p for p in slices.first[some].plates if all(p in slices.first[n].plates for n in placed)
+    ]
+    for layout in layouts:
+        hidden = layout.unknown | {n + PREVIOUS for n in layout.before}
+        for name in layout.placed:
+            for parent, link in layout.model[name].links:
+                if parent in hidden:
+                    found = [p for p in found if p not in link.foreign]
+    return tuple(found)
+
+
+def layouts_of(
+    slices: Slices, inner: Collection[str], apart: tuple[str, ...]
+) -> tuple[Layout, Layout]:
+    """Slice 0 and later ones, where all nodes with a density are known but some."""
+    known = frozenset(slices.stochastic) - frozenset(inner)
+    unknown = always_unknown(slices, known)
+    before = tuple(n for n in slices.interface if n in unknown)
+    first, later = (Layout(slices, apart, k == 0, before, unknown) for k in range(2))
+    return first, later
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -225,16 +256,9 @@ class _Search:
     def _size(self, name: str) -> int:
         return math.prod(self.slices.first[name].value_shape)
 
-    def _layouts(self, inner: Collection[str]) -> tuple[Layout, Layout]:
-        known = frozenset(self.slices.stochastic) - frozenset(inner)
-        unknown = always_unknown(self.slices, known)
-        before = tuple(n for n in self.slices.interface if n in unknown)
-        first, later = (Layout(self.slices, self.apart, k == 0, before, unknown) for k in range(2))
-        return first, later
-
     def _fault(self, inner: Collection[str]) -> tuple[str, str] | None:
         """The first node that is not linear-Gaussian in what is integrated out, and why."""
-        for layout in self._layouts(inner):
+        for layout in layouts_of(self.slices, inner, self.apart):
             for name in layout.order:
                 reason = self._reason_in(layout, name)
                 if reason is not None:
@@ -242,7 +266,9 @@ class _Search:
         return None
 
     def _reason(self, inner: Collection[str], name: str) -> str | None:
-        reasons = (self._reason_in(layout, name) for layout in self._layouts(inner))
+        reasons = (
+            self._reason_in(layout, name) for layout in layouts_of(self.slices, inner, self.apart)
+        )
         return next((r for r in reasons if r is not None), None)
 
     def _reason_in(self, layout: Layout, name: str) -> str | None:

@@ -25,7 +25,7 @@ from bayesmc.engines.marginal.choices import Choices
 from bayesmc.engines.marginal.gaussians import Gaussians, Taken, nothing, take_in
 from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.scouting import MarginalScouting
-from bayesmc.engines.marginal.split import Split
+from bayesmc.engines.marginal.split import Split, blocks_of
 from bayesmc.engines.particles.filter_step import FilterStep, has_weight
 from bayesmc.engines.particles.smc import Particles, Selection
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals
@@ -97,6 +97,8 @@ class MarginalStep(FilterStep):
         self.sampling = MarginalPlan(plan.slices, plan.apart, plan.static, proposals)
         self.is_guided = self.looks or self.sampling.guided
         self._places: dict[Any, Place] = {}
+        #: plates whose elements do not meet given what is sampled: small Gaussians instead of a large one
+        self.blocks = () if self.looks or plan.apart else blocks_of(plan.slices, split)
 
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
         place = self.place(row, None if earlier is None else earlier.inner)
@@ -147,7 +149,10 @@ class MarginalStep(FilterStep):
             pattern, target, given = seen_of(place.layout, row)
             coefficients = place.reader.read(known)
             made = take_in(place.layout, pattern, inner, coefficients, target, given)
-            return values, log + made.log[:, 0], made.chosen(None)
+            own = made.log[:, 0]
+            if self.blocks:
+                own = own.sum(axis=tuple(range(1, own.ndim)))
+            return values, log + own, made.chosen(None)
         joint, made = self.looked(place, place.choices, row, known, inner)
         own, at = place.choices.drawn(joint, rng)
         values |= self.chosen_values(place, place.choices, known, values, at)
@@ -215,7 +220,8 @@ class MarginalStep(FilterStep):
             late = (self.split.seen - full) & self.split.below
             known = full | (frozenset(self.slices.stochastic) - self.integrated - late)
             unknown = unknown_nodes(self.slices, row.t == 0, known, carried)
-            layout = Layout(self.slices, self.layout.apart, row.t == 0, carried, unknown)
+            apart = (*self.layout.apart, *self.blocks)
+            layout = Layout(self.slices, apart, row.t == 0, carried, unknown)
             guarded = [n for n in layout.seen if n not in full]
             if guarded:
                 raise UnsupportedError(

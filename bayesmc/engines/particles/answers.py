@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -117,8 +116,8 @@ class Answers(NamedTuple):
         flat = flat - shares @ flat
         matrix = (flat * shares[:, None]).T @ flat
         if now.inner is not None:
-            sizes = {name: math.prod(self.model[name].value_shape) for name in names}
-            matrix += covariance_within(now.inner, sizes, shares)
+            nodes = [self.model[name] for name in names]
+            matrix += covariance_within(now.inner, nodes, shares)
         return matrix[0, 0] if matrix.size == 1 else matrix
 
 
