@@ -484,6 +484,8 @@ def test_what_does_not_go_together_is_refused_by_name() -> None:
             bmc.ParticleFilter(10, marginalize="auto", **option)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="names of hidden nodes"):
         bmc.ParticleFilter(10, marginalize=3)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="has no machine code"):
+        bmc.ParticleFilter(10, marginalize="auto", compiled=True)
     with pytest.raises(ValueError, match="nothing is named"):
         bmc.ParticleFilter(10, marginalize=[])
     with pytest.raises(UnsupportedError, match="lag= answers by the ancestors"):

@@ -176,6 +176,8 @@ class FiniteFilter(FilterEngine):
         return type(self).__name__
 
     def _words(self, reason: str) -> str:
+        if reason.startswith(f"{self._name}("):  # of its options
+            return reason
         return (
             f"{self._name} needs every hidden node to have finitely many values, but {reason}; use "
             "ParticleFilter(particles)"

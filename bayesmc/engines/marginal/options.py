@@ -47,6 +47,10 @@ def read_marginalize(engine: Any) -> Any:
             raise ValueError(
                 f"ParticleFilter: marginalize= and {option}= do not go together; leave one of them out"
             )
+    if engine.compiled:
+        raise ValueError(
+            "ParticleFilter: what marginalize= integrates out has no machine code; leave compiled= out"
+        )
     return AUTO if given == AUTO else tuple(dict.fromkeys(names))
 
 

@@ -119,6 +119,11 @@ class ParticleFilter(FilterEngine):
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
+    compiled : bool, optional
+        Whether slices are machine code, which needs the extra `[fast]`: always, never, or by default where
+        the series would take more than a tenth of a second in NumPy, or where machine code of an earlier run
+        is at hand and saves more than loading it takes. The particles are the same to rounding. `explain`
+        says what is not, and why.
     budget : int
         Particles times slices (times elements of plates that are filtered separately) that this may take:
         seconds. With ``proposal="optimal"`` or ``auxiliary=True`` each counts as 20, which is about what a
@@ -186,6 +191,7 @@ class ParticleFilter(FilterEngine):
     recovery: Recovery | None = None
     marginalize: Any = None
     tolerance: float = TOLERANCE
+    compiled: bool | None = None
     budget: int = BUDGET
 
     label: ClassVar[str] = "particle filter"
@@ -198,6 +204,10 @@ class ParticleFilter(FilterEngine):
         check_numbers(self)
         scheme_of(self.resampling)
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
+        if self.compiled not in (None, True, False):
+            raise ValueError(
+                f"ParticleFilter(compiled={self.compiled!r}): give True, False or None"
+            )
         check_kind("adapt", self.adapt, KLD)
         check_kind("recovery", self.recovery, Recovery)
         for option in _FUNCTIONS:
@@ -256,7 +266,7 @@ class ParticleFilter(FilterEngine):
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
         if step.integrated:
             return "a Kalman filter for each particle"
-        return told(step, problem, self.resampling == "systematic")
+        return told(step, problem, self.compiled)
 
     def filter(
         self,
@@ -386,7 +396,7 @@ class ParticleFilter(FilterEngine):
         kept = None if keep else [*problem.hidden, *asked]
         step = self.step_of(problem.slices, problem.known_static, kept, problem.seen)
         if not step.integrated:
-            step = compiled_step(step, problem.steps, self.resampling == "systematic")
+            step = compiled_step(step, problem.steps, self.compiled)
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _integrates(self, problem: SeriesProblem) -> bool:
