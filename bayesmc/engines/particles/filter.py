@@ -281,7 +281,8 @@ class ParticleFilter(FilterEngine):
             raise ValueError(
                 f'keep={keep!r}: give "particles", or None for answers of constant size'
             )
-        warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
+        if not self._integrates(problem):
+            warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
             sized = self._sized(self._enough(problem, seed, keep is not None, progress))
             found = sized._passed(problem, seed, keep is not None, queries or {}, progress)
@@ -309,7 +310,8 @@ class ParticleFilter(FilterEngine):
         why = self.unable(problem, Asked("smooth" if lag is None else "fixed-lag"))
         if why is not None:
             raise UnsupportedError(why)
-        warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
+        if not self._integrates(problem):
+            warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
@@ -372,7 +374,7 @@ class ParticleFilter(FilterEngine):
         return bound(self._sized(START), belief, dbn, slices)
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
-        if not isinstance(belief.made_by, FilterStep):
+        if self.marginalize is None and not isinstance(belief.made_by, FilterStep):
             warn_of_what_is_not_guided(self, slices, row.seen)
         found = absorbed(self._sized(START), belief, slices, row)
         if self.particles is None:

@@ -285,7 +285,7 @@ def warn_of_what_is_not_guided(engine: Any, slices: Slices, seen: Collection[str
     -----
     ProposalWarning
     """
-    if engine.proposal != "optimal" or engine.marginalize is not None:
+    if engine.proposal != "optimal":
         return
     missing = guidance(slices, seen, plates_apart(slices)).missing()
     if missing is not None:
