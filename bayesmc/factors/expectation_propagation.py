@@ -166,9 +166,7 @@ def propagate(
     skipped = out = np.zeros(lead, dtype=int)
     change = np.full(lead, np.inf)
     done = 0
-    while (
-        done < sweeps and not (change <= tolerance).all()
-    ):  # what is still left out then, stays so
+    while done < sweeps and not (change <= tolerance).all():  # what is left out then, stays out
         before, out = list(state.beliefs), np.zeros(lead, dtype=int)
         for visit in visits:
             out = out + state.visited(visit)
@@ -176,11 +174,11 @@ def propagate(
         change, skipped, done = np.max(moved, axis=0), skipped + out, done + 1
         if advance is not None:
             advance()
-    beliefs = [b.normalised() for b in state.beliefs]
-    totals = np.array([b.log_total for b in state.beliefs])
+    totals = state.normalise()
     cavities = [state.cavities(f) for f in range(len(factors))]
     logs = [f.tilted(c, ()).log for f, c in zip(factors, cavities, strict=True)]
     settled = (change <= tolerance) & (out == 0)
+    beliefs = [b.normalised() for b in state.beliefs]
     return Propagated(
         beliefs, cavities, np.reshape(logs, (len(factors), *lead)), totals,
         done, change, skipped, out, settled,
@@ -220,11 +218,18 @@ class _State:
             new = own[end].towards(belief.over(cavities[end], own[end]), self.share)
             belief = cavities[end].times(new.where(fine, own[end]))
             proper = fine & np.isfinite(belief.log_total)
-            out += fine & ~proper
-            own[end] = new.where(proper, own[end]).normalised()
-            place = factor.scope[end]
-            self.beliefs[place] = cavities[end].times(own[end])
+            if not proper.all():
+                out = out + (fine & ~proper)
+                new = new.where(proper, own[end])
+                belief = cavities[end].times(new)
+            own[end], self.beliefs[factor.scope[end]] = new, belief
         return out
+
+    def normalise(self) -> np.ndarray:
+        """Have messages integrate to 1 where they have an integral; logs of their products' integrals."""
+        self.sites = [[site.normalised() for site in own] for own in self.sites]
+        self.beliefs = [self._product(place, None) for place in range(len(self.priors))]
+        return np.array([b.log_total for b in self.beliefs])
 
     def cavities(self, f: int) -> list[Any]:
         """Of a factor, without its own messages."""

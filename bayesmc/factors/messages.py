@@ -118,13 +118,13 @@ class ConditionalGaussian(Message):
     @classmethod
     def of(cls, log: np.ndarray, mean: np.ndarray, factor: np.ndarray) -> ConditionalGaussian:
         """From moments; ``factor`` has lower roots of the covariances, without zeros on the diagonal."""
-        n = mean.shape[-1]
         none = log == -np.inf
-        factor = np.where(none[..., None, None], np.eye(n), factor)
-        left = np.linalg.solve(factor, np.broadcast_to(np.eye(n), factor.shape))
-        precision = np.matrix_transpose(left) @ left
+        if none.any():
+            factor = np.where(none[..., None, None], np.eye(mean.shape[-1]), factor)
+        left = inverse(factor)
+        right = left.swapaxes(-1, -2)
         scaled = np.matvec(left, mean)
-        linear = np.matvec(np.matrix_transpose(left), scaled)
+        precision, linear = right @ left, np.matvec(right, scaled)
         size = np.log(np.abs(factor.diagonal(0, -2, -1))).sum(axis=-1)
         found = log - size - 0.5 * np.vecdot(scaled, scaled)
         return cls(found, *_without(none, linear, precision))
@@ -172,23 +172,20 @@ class ConditionalGaussian(Message):
             return self
         return self._where(np.broadcast_to(chosen, self.log.shape), otherwise)
 
-    @property
+    @cached_property
     def log_total(self) -> np.ndarray:
-        log = self.moments.log
-        top = np.max(log, axis=0)
-        safe = np.where(np.isfinite(top), top, 0.0)
-        with np.errstate(divide="ignore"):
-            return np.where(np.isfinite(top), np.log(np.exp(log - safe).sum(axis=0)) + safe, np.nan)
+        return log_sum(self.moments.log)
 
     @cached_property
     def moments(self) -> Moments:
         """Of every state; the log is NaN where the integral is not finite."""
-        n = self.linear.shape[-1]
-        none = self.log == -np.inf
-        root, bad = try_cholesky(np.where(none[..., None, None], np.eye(n), self.precision))
-        left = np.linalg.solve(root, np.broadcast_to(np.eye(n), root.shape))
+        precision, none = self.precision, self.log == -np.inf
+        if none.any():
+            precision = np.where(none[..., None, None], np.eye(precision.shape[-1]), precision)
+        root, bad = try_cholesky(precision)
+        left = inverse(root)
         scaled = np.matvec(left, self.linear)
-        right = np.matrix_transpose(left)
+        right = left.swapaxes(-1, -2)
         size = np.log(root.diagonal(0, -2, -1)).sum(axis=-1)
         log = self.log + 0.5 * np.vecdot(scaled, scaled) - size
         if bad is not None:
@@ -223,6 +220,22 @@ class ConditionalGaussian(Message):
             np.where(chosen[..., None], self.linear, otherwise.linear),
             np.where(chosen[..., None, None], self.precision, otherwise.precision),
         )
+
+
+def inverse(root: np.ndarray) -> np.ndarray:
+    """Of matrices that have one, such as triangles with no zeros on the diagonal."""
+    return np.linalg.solve(root, np.eye(root.shape[-1]))
+
+
+def log_sum(log: np.ndarray) -> np.ndarray:
+    """Log of a sum of exponentials over the first axis; NaN where that is zero or not finite."""
+    top = log.max(axis=0)
+    fine = np.isfinite(top)
+    if fine.all():
+        return np.log(np.exp(log - top).sum(axis=0)) + top
+    safe = np.where(fine, top, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(fine, np.log(np.exp(log - safe).sum(axis=0)) + safe, np.nan)
 
 
 # ---- private ------------------------------------------------------------------------------------

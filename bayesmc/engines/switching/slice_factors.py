@@ -20,7 +20,7 @@ from bayesmc.engines.switching.merging import Mixture, merged
 from bayesmc.engines.switching.pairs import Groups, Pairs
 from bayesmc.engines.switching.passes import Back, Smoothed, noise_of
 from bayesmc.factors.expectation_propagation import Tilted
-from bayesmc.factors.messages import ConditionalGaussian
+from bayesmc.factors.messages import ConditionalGaussian, inverse, log_sum
 from bayesmc.gaussian import try_cholesky
 from bayesmc.linalg.square_root import condition_many
 
@@ -61,7 +61,7 @@ class Scale(NamedTuple):
         return np.linalg.solve(self.root[at], noise)
 
     def forward(self, log: np.ndarray, with_zeros: bool = False) -> ConditionalGaussian:
-        """The forward pass's belief; what it says of modes that it rules out does not matter without zeros."""
+        """The forward pass's belief; without zeros, anything of modes that it rules out."""
         precision = np.matrix_transpose(self.root) @ self.root
         linear = -np.matvec(np.matrix_transpose(self.root), self.mean)
         size = np.log(self.root.diagonal(0, -2, -1)).sum(axis=-1)
@@ -118,13 +118,12 @@ class SliceFactor:
 
     def tilted(self, cavities: Sequence[ConditionalGaussian], ends: Sequence[int]) -> Tilted:
         log, mean, right = self._noise(cavities)
-        top = np.max(log, axis=0)
-        safe = np.where(np.isfinite(top), top, 0.0)
-        total = np.log(np.exp(log - safe).sum(axis=0)) + safe
-        total = np.where(np.isfinite(top), total, np.nan)
-        if np.isnan(total).all():
+        total = log_sum(log)
+        fine = np.isfinite(total)
+        if not fine.any():
             return Tilted(total, [cavities[e] for e in ends])
-        log = np.where(np.isfinite(total), log, 0.0)
+        if not fine.all():
+            log = np.where(fine, log, 0.0)
         c = self.centre.shape[-1] // 2
         beliefs = []
         for end in ends:
@@ -145,8 +144,7 @@ class SliceFactor:
         factor = np.concatenate([self.along @ right, self.beside], axis=-1)
         groups = self.groups[1]
         found = merged(groups.logs(log), groups.of(numbers), groups.of(factor))
-        total = np.log(np.exp(found.log - found.log.max(axis=0)).sum(axis=0))
-        return found._replace(log=found.log - found.log.max(axis=0) - total)
+        return found._replace(log=found.log - log_sum(found.log))
 
     def _noise(
         self, cavities: Sequence[ConditionalGaussian]
@@ -158,18 +156,19 @@ class SliceFactor:
         for end, (cavity, at) in enumerate(zip(cavities, places, strict=True)):
             part = slice(end * c, (end + 1) * c)
             root, centre = self.root[..., part, :], self.centre[..., part]
-            turned = np.matrix_transpose(root)
+            turned = root.swapaxes(-1, -2)
             own = cavity.precision[at]
             rest = cavity.linear[at] - np.matvec(own, centre)
             log = log + cavity.log[at] + 0.5 * np.vecdot(centre, cavity.linear[at] + rest)
             linear = linear + np.matvec(turned, rest)
             precision = precision + turned @ own @ root
         none = log == -np.inf
-        precision = np.where(none[..., None, None], np.eye(2 * c), precision)
-        precision = 0.5 * (precision + np.matrix_transpose(precision))
+        if none.any():
+            precision = np.where(none[..., None, None], np.eye(2 * c), precision)
+        precision = 0.5 * (precision + precision.swapaxes(-1, -2))
         lower, bad = try_cholesky(precision)
-        left = np.linalg.solve(lower, np.broadcast_to(np.eye(2 * c), lower.shape))
-        scaled, right = np.matvec(left, linear), np.matrix_transpose(left)
+        left = inverse(lower)
+        scaled, right = np.matvec(left, linear), left.swapaxes(-1, -2)
         log = log + 0.5 * np.vecdot(scaled, scaled)
         log = log - np.log(lower.diagonal(0, -2, -1)).sum(axis=-1)
         if bad is not None:
