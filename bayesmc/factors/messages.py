@@ -195,7 +195,7 @@ class ConditionalGaussian(Message):
     def distance(self, other: ConditionalGaussian) -> np.ndarray:
         (one, weight), (two, also) = (m._expected() for m in (self, other))
         alive = (weight > 0) & (also > 0)
-        log = np.where(alive, self.log - other.log, 0.0)
+        log = np.where(alive, self.log, 0.0) - np.where(alive, other.log, 0.0)
         log = log - np.where(alive, self.log_total - other.log_total, 0.0)
         linear, precision = self.linear - other.linear, self.precision - other.precision
         mean, square = (a - b for a, b in zip(one, two, strict=True))
