@@ -13,6 +13,7 @@ import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from importlib.util import find_spec
 from time import perf_counter
 from typing import Any
 
@@ -41,6 +42,7 @@ ONLINE_STEPS, ONLINE_PARTICLES = 100_000, 100
 BUDGET = 4.0  # seconds for one entry of a table
 
 GOAL_PARTICLE, GOAL_EXACT = 1.5, 1.25
+FAST, GOAL_FAST = "bayesmc[fast]", 1.2
 GOAL_BATCHED, GOAL_CHAIN, GOAL_FILTERPY = 8.0, 20.0, 4.0
 GOAL_PEER = {1_000: 3.0, 10_000: 1.6, 100_000: 1.6, 1_000_000: 1.6}
 
@@ -120,13 +122,16 @@ def _growth(count: int, steps: int, peers: Mapping[str, Filters | None], repeats
         if worker is not None:
             entries[name] = worker.timed(**question, **more)
     if hasattr(bmc, "ParticleFilter"):
-        entries["bayesmc"] = _call("growth", {"y": y}, bmc.ParticleFilter(count))
+        entries |= _filters("growth", {"y": y}, count)
     times = interleave(entries, repeats, budget=BUDGET)
     baselines = {"numba": FUSED_PARTICLE[count], "particles": PEER_PARTICLE[count]}
     rows = _judged(times, baselines, GOAL_PARTICLE, count * (steps + 1))
     if {"particles", "bayesmc"} <= times.keys():
         gained = times["particles"].median / times["bayesmc"].median
         rows.append(["particles over bayesmc", "", "", gained, f"goal {GOAL_PEER[count]}"])
+    if {"numba", FAST} <= times.keys():
+        ratio = times[FAST].median / times["numba"].median
+        rows.append([f"{FAST} over numba", "", "", ratio, f"goal {GOAL_FAST}"])
     return table(
         f"particle filter, benchmark of de Freitas, {count} particles, {steps} slices",
         ["", "ms", "ns per particle and slice", "over floor", "baseline", ""],
@@ -144,13 +149,21 @@ def _more_states(name: str, repeats: int) -> str:
             "floor": lambda n=count, s=seeds: getattr(particle, name)(y, n, next(s))
         }
         if hasattr(bmc, "ParticleFilter"):
-            entries["bayesmc"] = _call(name, {"y": y}, bmc.ParticleFilter(count))
+            entries |= _filters(name, {"y": y}, count)
         times = interleave(entries, repeats, budget=BUDGET)
         for found in _judged(times, {}, GOAL_PARTICLE, count * steps):
             rows.append([f"{found[0]}, {count} particles", *found[1:]])
     title = {"trend": "three scalar states", "lorenz": "one state that is a 3-vector"}[name]
     header = ["", "ms", "ns per particle and slice", "over floor", "baseline", ""]
     return table(f"particle filter, {title}, {steps} slices", header, rows)
+
+
+def _filters(name: str, observations: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """In NumPy and, where there is a compiler, as machine code."""
+    found = {"bayesmc": _call(name, observations, bmc.ParticleFilter(count, compiled=False))}
+    if find_spec("llvmlite") is not None:
+        found[FAST] = _call(name, observations, bmc.ParticleFilter(count, compiled=True))
+    return found
 
 
 def _hmm(peers: Mapping[str, Filters | None], repeats: int) -> str:
@@ -288,6 +301,8 @@ def _judged(
         said: list[object] = [""]
         if name == "bayesmc":
             said = [f"goal {goal}"]
+        elif name == FAST and not baselines:
+            said = [f"goal {GOAL_FAST}"]
         elif name == "floor":
             missed = [p for p, w in baselines.items() if p in medians]
             missed = [p for p in missed if not reached(floor, medians[p], baselines[p])]

@@ -11,10 +11,12 @@ from bayesmc.linalg.patterns import cholesky, triangular
 def test_triangles_are_solved(width: int, rows: int) -> None:
     rng = np.random.default_rng(width)
     root = np.tril(rng.normal(size=(rows, 6, width, width))) + 3.0 * np.eye(width)
-    right = rng.normal(size=(5, 6, width, 2))
-    for transposed, matrix in ((False, root), (True, np.swapaxes(root, -1, -2))):
-        found = triangular(root, right, transposed)
-        np.testing.assert_allclose(matrix @ found, right, rtol=1e-11, atol=1e-11)
+    for columns, many in ((2, 1), (1, 1), (1, 9)):  # one column of many is solved row by row
+        roots = np.concatenate([root] * many)
+        right = rng.normal(size=(5 if many == 1 else rows * many, 6, width, columns))
+        for transposed, matrix in ((False, roots), (True, np.swapaxes(roots, -1, -2))):
+            found = triangular(roots, right, transposed)
+            np.testing.assert_allclose(matrix @ found, right, rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("width", [2, 3])

@@ -9,6 +9,7 @@ of 1e-4 (Holm over its figures); an ordinary run has some 40 of them, at fixed s
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -127,6 +128,31 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
         assert found, (case.dbn, found)
         tried += 1
     assert tried
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ModelMisfitWarning")
+def test_particle_filters_of_machine_code_agree() -> None:
+    """In every slice's figures at equal seeds; there is no chance in it."""
+    pytest.importorskip("llvmlite", reason="llvmlite is not installed")
+    told = []
+    for seed, case in (*cases("linear", 3 * MANY), *cases("one number", MANY)):
+        given = {"inputs": case.inputs, "rng": seed}
+        engine = bmc.ParticleFilter(500, compiled=True)
+        plain, fast = (
+            bmc.filter(case.dbn, case.observations, engine=replace(engine, compiled=own), **given)
+            for own in (False, True)
+        )
+        for name in plain.mean_errors:
+            for own, other in ((fast.mean, plain.mean), (fast.var, plain.var)):
+                np.testing.assert_allclose(own(name), other(name), rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(fast.mcse(name), plain.mcse(name), rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(
+            fast.log_marginal_increments, plain.log_marginal_increments, rtol=1e-9, atol=1e-9
+        )
+        question: dict[str, Any] = {"inputs": case.inputs, "question": "filter"}
+        told.append(bmc.explain(case.dbn, case.observations, engine=engine, **question).effort)
+    assert sum(text.startswith("slices as machine code") for text in told) >= 3, told
 
 
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")

@@ -106,6 +106,17 @@ class Series:
                 inputs[name + PREVIOUS] = values[k - 1, ...]
         return Row(t, seen, inputs)
 
+    def alike(self, k: int, most: int) -> int:
+        """How many rows from the k-th on see the same nodes, each in full or not at all; so many at most."""
+        last, looked_at = min(k + most, self.steps), self._looked_at.values()
+        masked = [(full, some) for _, full, some in looked_at if full is not None]
+        if not masked:
+            return last - k
+        for other in range(k, last):
+            if any(full[other] != full[k] or full[other] != some[other] for full, some in masked):
+                return other - k
+        return last - k
+
 
 def read_series(
     dbn: Compiled,

@@ -1,8 +1,8 @@
 """What a slice of a template does to its particles, as expressions: values, log weights, and what must hold.
 
-Random numbers are leaves of their own (standard normals), so that whatever evaluates the expressions gets the
-same particles from a seed. A node whose density cannot be followed, or is drawn in another way, is refused
-with the reason.
+Random numbers are leaves of their own (standard normals, or uniform numbers), so that whatever evaluates the
+expressions gets the same particles from a seed. A node whose density cannot be followed, or is drawn in
+another way, is refused with the reason.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ _SEEN = (
 )  # fmt: skip
 _POSITIVE = ("scale", "rate", "df", "concentration", "concentration0", "concentration1")
 #: families whose log density is finite only where location and scale are
-_TELLING = (d.Normal, d.StudentT, d.Laplace, d.Cauchy)
+_TELLING = (d.Normal, d.MvNormal, d.StudentT, d.Laplace, d.Cauchy)
+#: families that are drawn by a uniform number from [0, 1)
+_UNIFORM = (d.Uniform, d.Laplace)
 
 
 @dataclass(frozen=True)
@@ -55,12 +57,20 @@ class Drawn:
     shape : tuple of int
         Of these.
     value : Expression
+    is_uniform : bool
+        They are uniform numbers from [0, 1) instead.
     """
 
     name: str
     noise: str
     shape: tuple[int, ...]
     value: Expression
+    is_uniform: bool = False
+
+    def draw(self, rng: np.random.Generator, batch: tuple[int, ...]) -> np.ndarray:
+        """Its random numbers, of a batch."""
+        draw = rng.random if self.is_uniform else rng.standard_normal
+        return np.asarray(draw((*batch, *self.shape)))
 
 
 @dataclass(frozen=True)
@@ -133,14 +143,15 @@ def read_slice(
         family = _family(model, name, given, cut)
         must, told = _in_range(name, family, name in seen)
         if name in seen:
-            if family.make not in _SEEN:
+            if family.make not in _SEEN and not _has_known_spread(family):
                 raise TraceError(f"node {name!r} is seen through a family without machine code")
             each = substituted(log_density_of(model, name, cut), given)
             log = add(log, reduction(np.add, each, range(len(each.shape))))
         else:
             noise, shape = f"\0noise of {name}", (*node.plate_shape, *node.event_shape)
             given[name] = _draw(name, family, leaf(noise, shape))
-            drawn.append(Drawn(name, noise, shape, given[name]))
+            is_uniform = family.make in _UNIFORM
+            drawn.append(Drawn(name, noise, shape, given[name], is_uniform))
             told = _and(told, _everywhere(elementwise(np.isfinite, given[name])))
         good, shows = _and(good, must), _and(shows, told)
     values = {n: given[n] for n in kept if n in given}
@@ -168,23 +179,44 @@ def _family(
     return Family(family.make, parameters)
 
 
+def _has_known_spread(family: Family) -> bool:
+    """Whether it is a multivariate normal whose covariance is known."""
+    scales = [family.parameters.get(k) for k in ("cov", "scale_tril", "scale_diag")]
+    known = all(s is None or isinstance(s, Constant) for s in scales)
+    return family.make is d.MvNormal and known
+
+
 def _draw(name: str, family: Family, noise: Expression) -> Expression:
-    """A draw of a hidden node as its family makes it of standard normals."""
+    """A draw of a hidden node as its family makes it of standard normals, or of uniform numbers."""
     p = family.parameters
+    if family.make is d.HalfNormal:
+        return elementwise(np.multiply, elementwise(np.absolute, noise), p["scale"])
+    if family.make is d.Uniform:
+        width = elementwise(np.subtract, p["high"], p["low"])
+        draw = elementwise(np.add, elementwise(np.multiply, noise, width), p["low"])
+        return elementwise(np.minimum, draw, p["high"])
+    if family.make is d.Laplace:
+        return elementwise(np.add, elementwise(np.multiply, _laplace(noise), p["scale"]), p["loc"])
     if family.make in (d.Normal, d.LogNormal):
         draw = elementwise(np.add, elementwise(np.multiply, noise, p["scale"]), p["loc"])
         return draw if family.make is d.Normal else elementwise(np.exp, draw)
-    if family.make is d.MvNormal:
-        scales = [p.get(k) for k in ("cov", "scale_tril", "scale_diag")]
-        if all(s is None or isinstance(s, Constant) for s in scales):
-            cov, tril, diag = scales
-            if diag is not None:
-                moved = elementwise(np.multiply, noise, diag)
-            else:
-                factor = np.linalg.cholesky(cov.value) if tril is None else tril.value  # type: ignore[union-attr]
-                moved = product(np.matvec, as_expression(factor), noise)
-            return elementwise(np.add, moved, p["loc"])
+    if _has_known_spread(family):
+        cov, tril, diag = (p.get(k) for k in ("cov", "scale_tril", "scale_diag"))
+        if diag is not None:
+            moved = elementwise(np.multiply, noise, diag)
+        else:
+            factor = np.linalg.cholesky(cov.value) if tril is None else tril.value  # type: ignore[union-attr]
+            moved = product(np.matvec, as_expression(factor), noise)
+        return elementwise(np.add, moved, p["loc"])
     raise TraceError(f"node {name!r} is drawn from a family without machine code")
+
+
+def _laplace(u: Expression) -> Expression:
+    """What NumPy makes of a uniform number; it draws another one in place of 0, which is infinite here."""
+    twice = elementwise(np.add, u, u)
+    upper = elementwise(np.negative, elementwise(np.log, elementwise(np.subtract, 2.0, twice)))
+    above = elementwise(np.greater_equal, u, 0.5)
+    return elementwise(np.where, above, upper, elementwise(np.log, twice))
 
 
 def _in_range(name: str, family: Family, is_seen: bool) -> tuple[Expression, Expression]:
@@ -193,7 +225,10 @@ def _in_range(name: str, family: Family, is_seen: bool) -> tuple[Expression, Exp
     Those that are known have been looked at.
     """
     good, shows = _everywhere(in_range(family)), TRUE
-    telling = family.make in (_TELLING if is_seen else (d.Normal, d.MvNormal))
+    telling = family.make in (_TELLING if is_seen else (d.Normal, d.MvNormal, d.Laplace))
+    if family.make is d.Uniform:
+        above = elementwise(np.greater, family.parameters["high"], family.parameters["low"])
+        good = _and(good, _everywhere(above))
     for key, value in family.parameters.items():
         if value is None or isinstance(value, Constant):
             continue

@@ -1,8 +1,8 @@
 """A whole slice as one step: a program of NumPy's in place of its functions, called with distributions.
 
-The same normals are drawn in the same order, so that a seed gives the same particles to rounding. The first
-time, a template's program is held against the steps of its nodes; whatever is out of the ordinary later (a
-parameter out of range, a weight that is no number) is done again by these, which say what is wrong.
+The same random numbers are drawn in the same order, so that a seed gives the same particles to rounding. The
+first time, a template's program is held against the steps of its nodes; whatever is out of the ordinary later
+(a parameter out of range, a weight that is no number) is done again by these, which say what is wrong.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ class SliceProgram:
 
     def __call__(self, state: Pass) -> tuple[dict[str, np.ndarray], Any] | None:
         """Values and the log weight; None where the plain steps must do it: whose draws are then gone."""
-        values, draw = dict(state.values), state.rng.standard_normal
+        values = dict(state.values)
         for z in self.drawn:
-            values[z.noise] = draw((*state.batch, *z.shape))
+            values[z.noise] = z.draw(state.rng, state.batch)
         found = self.program(values)
         log = found[len(self.names)]
         good = all_finite(log)

@@ -21,11 +21,11 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from bayesmc.kernels.base import Kernel, Memory, counted
+from bayesmc.kernels.base import ANYHOW, How, Kernel, Memory, counted
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.slice import Slice
@@ -62,7 +62,8 @@ class Accepted(Kernel):
         self.left_out = [child.term for child in left_out]
         found = [term.expression for term in self.left_out]
         self.constraints = all(e is not None and is_constraint(e) for e in found)
-        self.proposal, self.other = proposal, other
+        self.proposal = proposal
+        self.other: Kernel | None = other
         self.label = proposal.label
         names = ", ".join(repr(term.name) for term in self.left_out)
         self.match = f"{proposal.match}, accepted by {names}"
@@ -73,48 +74,62 @@ class Accepted(Kernel):
     def expect(self, steps: int, chains: int) -> None:
         """Both kernels may want to know."""
         self.proposal.expect(steps, chains)
-        self.other.expect(steps, chains)
+        if self.other is not None:
+            self.other.expect(steps, chains)
 
     def start(self, values: Values, chains: int) -> Memory:
         """What the kernels remember, counts of what is accepted, and the rate learnt so far."""
-        own, other = self.proposal.start(values, chains), self.other.start(values, chains)
-        counts = {"accepted": np.zeros(chains), "moves": 0, "rate": 0.0}
-        return {"proposal": own, "other": other, **counts}
+        kernels = {"proposal": self.proposal, "other": self.other}
+        memory = {n: k.start(values, chains) for n, k in kernels.items() if k is not None}
+        return {**memory, "accepted": np.zeros(chains), "moves": 0, "rate": 0.0}
+
+    def alone(self) -> Accepted:
+        """The same without the other kernel: a single update, in balance with the way back."""
+        found = copy.copy(self)
+        found.other = None
+        return found
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
-        name, target = self.blanket.name, self.blanket.target
-        drawn, own = self.proposal.step(values, memory["proposal"], rng, warmup)
-        new = drawn[name]
-        state = {**values, name: new}
-        target.compute(state, self.blanket.path)
-        with np.errstate(
-            invalid="ignore"
-        ):  # of impossible places, which are left for possible ones
-            ratio = self._log(state) - self._log(values)
-        taken = rng.random(len(new)) < np.exp(np.minimum(ratio, 0.0))
-        chosen = taken.reshape(-1, *(1,) * (new.ndim - 1))
-        moved = {name: np.where(chosen, new, values[name])}
-        memory = {**memory, "proposal": own}
-        if not self.constraints or memory["rate"] < _OFTEN:
-            state = {**values, **moved}
-            target.compute(state, self.blanket.path)
-            moved, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
+        name = self.blanket.name
+        memory = dict(memory)
+        new, taken = self._proposed(values, memory, rng, warmup)
+        if self.other is not None and (not self.constraints or memory["rate"] < _OFTEN):
+            state = {**values, name: new}
+            self.blanket.target.compute(state, self.blanket.path)
+            found, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
+            new = found[name]
         if not warmup:
-            return moved, counted(memory, taken)
-        rate = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
-        return moved, {**memory, "rate": rate}
+            return {name: new}, counted(memory, taken)
+        memory["rate"] = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
+        return {name: new}, memory
 
     def moved(self, values: Values, memory: Memory) -> Memory:
         """What both kernels knew of the old place goes."""
-        own = self.proposal.moved(values, memory["proposal"])
-        return {**memory, "proposal": own, "other": self.other.moved(values, memory["other"])}
+        return self._each(memory, lambda kernel, own: kernel.moved(values, own))
 
     def end_warmup(self, memory: Memory) -> Memory:
         """Which kernels go on is settled."""
-        own = self.proposal.end_warmup(memory["proposal"])
-        return {**memory, "proposal": own, "other": self.other.end_warmup(memory["other"])}
+        return self._each(memory, lambda kernel, own: kernel.end_warmup(own))
+
+    def _each(self, memory: Memory, done: Callable[[Kernel, Memory], Memory]) -> Memory:
+        kernels = {"proposal": self.proposal, "other": self.other}
+        return memory | {n: done(k, memory[n]) for n, k in kernels.items() if k is not None}
+
+    def _proposed(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """New values where they are accepted, and which are; the proposal's memory is put in place."""
+        name, target = self.blanket.name, self.blanket.target
+        drawn, memory["proposal"] = self.proposal.step(values, memory["proposal"], rng, warmup)
+        state = {**values, name: drawn[name]}
+        target.compute(state, self.blanket.path)
+        with np.errstate(invalid="ignore"):  # of impossible places, left for possible ones
+            ratio = self._log(state) - self._log(values)
+        taken = rng.random(len(ratio)) < np.exp(np.minimum(ratio, 0.0))
+        chosen = taken.reshape(-1, *(1,) * (drawn[name].ndim - 1))
+        return np.where(chosen, drawn[name], values[name]), taken
 
     def _log(self, values: Values) -> np.ndarray:
         """Log of the terms left out, shape ``(chains,)``."""
@@ -137,9 +152,9 @@ def finite_kernel(blanket: Blanket) -> Kernel:
     return Enumerate(with_like_children(blanket))
 
 
-def number_kernel(blanket: Blanket, debug: bool = False) -> Kernel:
+def number_kernel(blanket: Blanket, debug: bool = False, how: How = ANYHOW) -> Kernel:
     """The closed form that a node has but for potentials, accepted by these; slices where it has none."""
-    slices = Slice(with_like_children(blanket), debug)
+    slices = Slice(with_like_children(blanket), debug, how)
     potentials = [child for child in blanket.children if child.term.is_potential]
     if not potentials:
         return slices

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,26 @@ from bayesmc.structure.target import Values
 Memory = dict[str, Any]
 #: how far the log ratio may be from zero, relative to the sizes of the terms it is made of
 TOLERANCE = 1e-9
+
+
+@dataclass(frozen=True)
+class How:
+    """What of kernels is machine code.
+
+    Attributes
+    ----------
+    compiled : bool or None
+        Always, never, or where a run is long enough to pay for it.
+    threads : int
+        Threads that share the chains then; the result is the same.
+    """
+
+    compiled: bool | None = None
+    threads: int = 1
+
+
+#: where nobody says
+ANYHOW = How()
 
 
 class Kernel:
@@ -42,6 +63,10 @@ class Kernel:
 
     def expect(self, steps: int, chains: int) -> None:  # noqa: B027 - most need not know
         """Told before a run how many steps its warmup takes, and of how many chains."""
+
+    def told(self, steps: int, chains: int) -> str:
+        """What else there is to say of such a run: whether it is machine code, and why not."""
+        return ""
 
     def start(self, values: Values, chains: int) -> Memory:
         """Its memory before the first step."""

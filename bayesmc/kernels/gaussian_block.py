@@ -65,23 +65,28 @@ class Factor:
     log_det: np.ndarray
     bad: np.ndarray
 
-    def solved(self, linear: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
-        """The mean, plus noise of the Gaussian's covariance, shape (chains, size)."""
+    def halves(self, linear: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A vector by the inverse of the precision's root: of what is eliminated first, and of the rest."""
         layout, cut = self.layout, self.layout.cut
-        head, right = linear[:, :cut], linear[:, cut:]
-        joined = np.empty_like(linear)
+        head, half = linear[:, :cut], linear[:, cut:]
         if cut:
             head = layout.first.lower(self.root, head[..., None])[..., 0]
         if layout.dg:
             if cut:
-                right = right - np.vecmat(head, self.mixed)
-            half = _triangle(self.rest, right, "N")
-            if noise is not None:
-                half = half + noise[:, cut:]
+                half = half - np.vecmat(head, self.mixed)
+            half = _triangle(self.rest, half, "N")
+        return head, half
+
+    def solved(self, linear: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
+        """The mean, plus noise of the Gaussian's covariance, shape (chains, size)."""
+        layout, cut = self.layout, self.layout.cut
+        joined = np.empty_like(linear)
+        head, half = self.halves(linear)
+        if noise is not None:
+            head, half = head + noise[:, :cut], half + noise[:, cut:]
+        if layout.dg:
             joined[:, cut:] = _triangle(self.rest, half, "T")
         if cut:
-            if noise is not None:
-                head = head + noise[:, :cut]
             if layout.dg:
                 head = head - np.matvec(self.mixed, joined[:, cut:])
             joined[:, :cut] = layout.first.upper(self.root, head[..., None])[..., 0]
@@ -184,9 +189,10 @@ class GaussianBlock(Kernel):
         Minus infinity where a parameter overflows or the precision is not positive definite.
         """
         sums = self._summed(values, count)
-        mean, log_det, bad = solved(self.layout, sums, None)
-        log = sums.constant + 0.5 * np.vecdot(sums.linear, mean) - 0.5 * log_det
-        return np.where(bad | np.isnan(log), -np.inf, log)
+        factor = factored(self.layout, sums.precision)
+        square = sum(np.vecdot(part, part) for part in factor.halves(sums.linear))
+        log = sums.constant + 0.5 * square - 0.5 * factor.log_det
+        return np.where(sums.bad | factor.bad | np.isnan(log), -np.inf, log)
 
     # ---- private -------------------------------------------------------------------------------
 

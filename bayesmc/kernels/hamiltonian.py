@@ -30,6 +30,8 @@ from bayesmc.structure.target import Values
 GRADIENTS = 8
 #: doublings of a trajectory before a metric is learnt, at most: long ones tell no more
 _EARLY = 5
+#: gradients that pay for machine code of any density
+_MANY = 10**9
 
 
 class Density(Protocol):
@@ -65,6 +67,8 @@ class Hamiltonian(Kernel):
         Why these nodes move so, for the table of kernels.
     threads : int
         Threads that share the chains where trajectories are machine code; the result is the same.
+    compiled : bool, optional
+        Whether trajectories are machine code; by default where a run is long enough to pay for it.
     debug : bool
         Compare machine code with NumPy at every step.
 
@@ -112,6 +116,7 @@ class Hamiltonian(Kernel):
         metric: Metric = "diagonal",
         match: str = "",
         threads: int = 1,
+        compiled: bool | None = None,
         debug: bool = False,
     ) -> None:
         self.density = density
@@ -119,7 +124,7 @@ class Hamiltonian(Kernel):
         self.given = given
         self.max_depth = max_depth
         self.match = match
-        self.threads, self.debug = threads, debug
+        self.threads, self.compiled, self.debug = threads, compiled, debug
         self._compiled: CompiledTransition | None = None
         self.step_size = StepSize(target_accept)
         self.metric = MetricLearning(metric)
@@ -128,10 +133,15 @@ class Hamiltonian(Kernel):
     def expect(self, steps: int, chains: int) -> None:
         """Gradients are machine code where so many steps pay for it."""
         if isinstance(self.density, UnconstrainedDensity):
-            made = in_machine_code(self.density, GRADIENTS * steps, chains, self.debug)
+            made = in_machine_code(self.density, self._calls(steps), chains, self.debug)
             self.density, self._compiled = made, None
             if made.trajectories is not None:
                 self._compiled = CompiledTransition(made.trajectories, made, self.threads)
+
+    def told(self, steps: int, chains: int) -> str:
+        if not isinstance(self.density, UnconstrainedDensity):
+            return ""
+        return in_machine_code(self.density, self._calls(steps), chains).told
 
     def start(self, values: Values, chains: int) -> Memory:
         u = self.density.unconstrain(values)
@@ -200,6 +210,12 @@ class Hamiltonian(Kernel):
             return np.asarray(energy["steps"] / energy["square"])
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _calls(self, steps: int) -> int:
+        """Gradients that a run asks for at least; where it is said, as many as pay for it, or none."""
+        if self.compiled is None:
+            return GRADIENTS * steps
+        return _MANY if self.compiled else 0
 
     def _gradient(self, values: Values) -> Gradient:
         def gradient(u: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

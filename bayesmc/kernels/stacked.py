@@ -60,6 +60,12 @@ class Stacked(Kernel):
         label, match = self.kernel.words(self.stack.one.name)
         return label, f"{match}{', ' if match else ''}{len(self.names)} like nodes at once"
 
+    def expect(self, steps: int, chains: int) -> None:
+        self.kernel.expect(steps, chains * len(self.names))
+
+    def told(self, steps: int, chains: int) -> str:
+        return self.kernel.told(steps, chains * len(self.names))
+
     def start(self, values: Values, chains: int) -> Memory:
         return self.kernel.start(self.stack.gathered(values), chains)
 

@@ -12,6 +12,7 @@ Rue and Held (2005), Gaussian Markov Random Fields, sec. 2.4.
 from __future__ import annotations
 
 import functools
+import math
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -21,6 +22,8 @@ from bayesmc.gaussian import try_cholesky
 
 #: rows up to which a triangle is solved row by row for all matrices at once
 _BY_ROW = 4
+#: triangles from which on one vector each is solved row by row, however large: NumPy would factorise them
+_MANY = 32
 
 
 class Pattern(ABC):
@@ -206,6 +209,8 @@ def triangular(root: np.ndarray, right: np.ndarray, transposed: bool) -> np.ndar
     [1.0, 2.0]
     """
     width = root.shape[-1]
+    if width > _BY_ROW and right.shape[-1] == 1 and math.prod(root.shape[:-2]) >= _MANY:
+        return _by_dots(root, right[..., 0], transposed)[..., None]
     if width > _BY_ROW:
         return np.linalg.solve(np.swapaxes(root, -1, -2) if transposed else root, right)
     lead = np.broadcast_shapes(root.shape[:-2], right.shape[:-2])
@@ -247,6 +252,19 @@ def lapack() -> Any:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _by_dots(root: np.ndarray, right: np.ndarray, transposed: bool) -> np.ndarray:
+    """Triangles solved for a vector each, row by row."""
+    lead = np.broadcast_shapes(root.shape[:-2], right.shape[:-1])
+    width, diagonal = root.shape[-1], np.linalg.diagonal(root)
+    found = np.empty((*lead, width))
+    for k in reversed(range(width)) if transposed else range(width):
+        at = slice(k + 1, None) if transposed else slice(k)
+        factor = root[..., at, k] if transposed else root[..., k, at]
+        off = right[..., k] - np.vecdot(factor, found[..., at])
+        np.divide(off, diagonal[..., k], out=found[..., k])
+    return found
 
 
 def _of_two(matrices: np.ndarray) -> np.ndarray:

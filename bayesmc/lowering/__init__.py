@@ -8,26 +8,47 @@ nothing here is used.
 from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
-from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
+from bayesmc.lowering.compiled import Bound, Compiled, address_of, compiled
 from bayesmc.lowering.gaussians import Coefficients, GaussianLoops, gaussian_loops
 from bayesmc.lowering.kernel import Kernel
+from bayesmc.lowering.lineage import followed
 from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.series import (
+    NO_NUMBERS,
+    Cloud,
+    Made,
+    Noise,
+    Numbers,
+    SliceCall,
+    SliceKernel,
+    known_column,
+)
+from bayesmc.lowering.slices import Slices, Turns
 from bayesmc.lowering.trajectory import Told, Trajectories
-from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
+    "NO_NUMBERS",
     "Bound",
+    "Cloud",
     "Coefficients",
     "Compiled",
     "GaussianLoops",
     "Kernel",
+    "Made",
+    "Noise",
+    "Numbers",
+    "SliceCall",
     "SliceKernel",
+    "Slices",
     "Told",
     "Trajectories",
+    "Turns",
+    "address_of",
     "compiled",
+    "followed",
     "gaussian_loops",
     "held_against_numpy",
     "is_available",
     "is_worth_it",
-    "weight_loops",
+    "known_column",
 ]

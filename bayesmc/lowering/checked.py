@@ -21,14 +21,23 @@ _ONE, _PAIR = 2e-4, 5e-8
 _RTOL = 1e-9
 
 
-def is_worth_it(roots: Sequence[Expression], calls: int, entries: int = 1) -> bool:
+def is_worth_it(roots: Sequence[Expression], calls: int, entries: int = 1, beside: int = 0) -> bool:
     """Whether so many calls, of so many entries each, take longer in NumPy than compiling.
 
     And longer than a tenth of a second. By a count of nodes and elements, not by a clock: the same question
     is answered the same way again.
+
+    Parameters
+    ----------
+    roots : sequence of Expression
+    calls, entries : int
+    beside : int
+        Steps in NumPy that each call takes besides, and machine code does not.
     """
     nodes = ordered(*roots)
-    seconds = calls * (_NODE * len(nodes) + _ELEMENT * entries * sum(n.size for n in nodes))
+    seconds = calls * (
+        _NODE * (len(nodes) + beside) + _ELEMENT * entries * sum(n.size for n in nodes)
+    )
     written = written_out(nodes)
     return seconds > max(_WORTH, _ONE * written + _PAIR * written**2)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -171,17 +171,17 @@ class Way:
     roots : sequence of Expression
     varying : frozenset of str
         Leaves that have values of their own for each entry.
-    chosen : frozenset of str, optional
-        Of those the ones that are read at other entries.
+    kernel : Kernel, optional
+        Of these, where it is written already.
     """
 
     def __init__(
         self,
         roots: Sequence[Expression],
         varying: frozenset[str],
-        chosen: frozenset[str] = frozenset(),
+        kernel: Kernel | None = None,
     ) -> None:
-        self.kernel = Kernel(roots, varying, chosen)
+        self.kernel = kernel or Kernel(roots, varying)
         self.loaded: Loaded = loaded(self.kernel.text, self.kernel.foreign)
         self._constants = list(self.kernel.constants.values())
         self._own = threading.local()
@@ -214,140 +214,6 @@ class Way:
         fixed = [address_of(a) for a in (*self._constants, *kept)]
         leaves, last = len(self.kernel.leaves), results + bool(self.kernel.chosen)
         return np.array([*[0] * leaves, *fixed, *[0] * last], np.uintp), kept
-
-
-class SliceKernel:
-    """Expressions of many particles, whose values in the slice before are those of their ancestors.
-
-    Parameters
-    ----------
-    roots : sequence of Expression
-    own : frozenset of str
-        Leaves that have values of their own for each particle.
-    chosen : frozenset of str
-        Leaves with a value for each particle before. Of all others there is one value.
-
-    Attributes
-    ----------
-    shapes : list of tuple
-        Of the results of one particle; they are real numbers.
-
-    Raises
-    ------
-    TraceError
-    """
-
-    def __init__(
-        self, roots: Sequence[Expression], own: frozenset[str], chosen: frozenset[str]
-    ) -> None:
-        if not is_available():
-            raise TraceError("machine code needs llvmlite: pip install bayesmc[fast]")
-        if any(r.dtype.kind != "f" for r in roots):
-            raise TraceError("particles that are not real numbers")
-        self.shapes = [r.shape for r in roots]
-        self._own, self._chosen = own, chosen
-        self._way = Way(roots, own | chosen, chosen)
-        self._wide = [bool(r.leaves & (own | chosen)) for r in roots]
-        if not all(self._wide):
-            raise TraceError("what is the same for all particles is made by plain steps")
-
-    def call(self, own: Mapping[str, np.ndarray]) -> SliceCall:
-        """The function with memory of its own, and arrays that are filled before each call.
-
-        Parameters
-        ----------
-        own : mapping
-            Leaf -> values of the particles of one call, in C order.
-        """
-        return SliceCall(self._way, self.shapes, own, self._chosen)
-
-
-class SliceCall:
-    """Calls of a ``SliceKernel``, not from two threads at once.
-
-    Parameters
-    ----------
-    way : Way
-    shapes : sequence of tuple
-        Of the results of one particle.
-    own : mapping
-    chosen : frozenset of str
-    """
-
-    def __init__(
-        self,
-        way: Way,
-        shapes: Sequence[Shape],
-        own: Mapping[str, np.ndarray],
-        chosen: frozenset[str],
-    ) -> None:
-        self._own, self._held = dict(own), list[np.ndarray]()
-        self._table, self._memory = way.table(len(shapes))
-        self._address, self._call = address_of(self._table), way.loaded.call
-        self._known: list[tuple[str, np.ndarray]] = []
-        self._chosen: list[tuple[int, str]] = []
-        for k, node in enumerate(way.kernel.leaves):
-            if node.name in chosen:
-                self._chosen.append((k, node.name))
-                continue
-            array = own.get(node.name)
-            if array is None:
-                array = np.empty(node.shape, DTYPES[kind_of(node)])
-                self._known.append((node.name, array))
-            self._table[k] = address_of(array)
-        self._first = len(self._table) - len(shapes)
-        self._rows = self._first - 1 if chosen else None
-        self._shapes = [(s, 8 * math.prod(s)) for s in shapes]
-        self._moving: list[tuple[int, int, int]] = []
-
-    def begin(
-        self,
-        known: Mapping[str, np.ndarray],
-        before: Mapping[str, np.ndarray],
-        rows: np.ndarray,
-        room: Callable[[tuple[int, ...]], np.ndarray],
-        particles: int,
-    ) -> list[np.ndarray]:
-        """Arrays for the results of so many particles, which calls then fill.
-
-        Parameters
-        ----------
-        known : mapping
-            Leaves with one value for all.
-        before : mapping
-            Leaves with one value for each particle before.
-        rows : ndarray of int64
-            Of each particle the ancestor.
-        room : callable
-            An array of a shape.
-        """
-        table = self._table
-        for name, array in self._known:
-            array[...] = known[name] if name in known else before[name]
-        held: list[np.ndarray] = []
-        for k, name in self._chosen:
-            array = np.ascontiguousarray(before[name], float)
-            held.append(array)
-            table[k] = address_of(array)
-        found = [room((particles, *shape)) for shape, _ in self._shapes]
-        moving = self._moving = [
-            (k, address_of(array), size)
-            for k, (array, (_, size)) in enumerate(
-                zip(found, self._shapes, strict=True), self._first
-            )
-        ]
-        if self._rows is not None:
-            rows = np.ascontiguousarray(rows, np.int64)
-            held.append(rows)
-            moving.append((self._rows, address_of(rows), 8))
-        self._held = held  # as long as calls read them
-        return found
-
-    def __call__(self, low: int, count: int) -> int:
-        """Results of so many particles from ``low`` on; 0 where all went well."""
-        for place, first, size in self._moving:
-            self._table[place] = first + low * size
-        return int(self._call(count, self._address))
 
 
 class Bound:

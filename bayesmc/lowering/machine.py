@@ -77,11 +77,11 @@ def loaded(text: str, foreign: tuple[str, ...]) -> Loaded:
     ImportError
         There is no llvmlite.
     """
-    binding, _, identity = _compiler()
+    binding, _, _ = _compiler()
     for name in foreign:
         if name.startswith(SCIPY):
             binding.add_symbol(name, _scipy_address(name.removeprefix(SCIPY)))
-    key = hashlib.sha256(f"{identity}\n{text}".encode()).hexdigest()
+    key = _key(text)
     code = read(key)
     if code is not None:
         with suppress(RuntimeError):
@@ -89,6 +89,11 @@ def loaded(text: str, foreign: tuple[str, ...]) -> Loaded:
     code = _compiled(text)
     write(key, code)
     return Loaded(code, False)
+
+
+def is_kept(text: str) -> bool:
+    """Whether machine code of a text is in the cache."""
+    return read(_key(text)) is not None
 
 
 def read(key: str) -> bytes | None:
@@ -126,6 +131,11 @@ def write(key: str, code: bytes) -> None:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _key(text: str) -> str:
+    """The name of a text's object in the cache."""
+    return hashlib.sha256(f"{_compiler()[2]}\n{text}".encode()).hexdigest()
 
 
 def _folder(make: bool) -> Path | None:

@@ -65,12 +65,30 @@ def transitions() -> Any:
     ``arguments``, the address of the first chain's value and the bytes to the next one's.
     """
     module = Module()
-    texts = [_turns(module), _uniform(module), _Text(module).text]
+    texts = [_turns(module), _copied(module), uniform(module), _Text(module).text]
     code = loaded("\n".join([str(module), *texts]), module.foreign)
     types = [ctypes.c_int64] * len(_WHOLES) + [ctypes.c_void_p] * len(_POINTERS)
     found = code.function("transitions", None, *types)
     found.code = code  # the function lives as long as this
     return found
+
+
+def uniform(module: Module) -> str:
+    """The function of a number above 0 and up to 1, by xoshiro256++."""
+    c = Code(module)
+    s = [c.load("%seed", k, WHOLE) for k in range(4)]
+
+    def rotated(x: Number, by: int) -> Number:
+        return c.call("llvm.fshl.i64", x, x, c.number(by, WHOLE), kind=WHOLE)
+
+    found = rotated(s[0] + s[3], 23) + s[0]
+    t = s[1].shifted(17)
+    third, fourth = s[2] ^ s[0], s[3] ^ s[1]
+    for k, value in enumerate((s[0] ^ fourth, s[1] ^ third, third ^ t, rotated(fourth, 45))):
+        c.store("%seed", k, value)
+    top = c.op(WHOLE, f"lshr i64 {found.text}, 11")
+    c.do(f"ret double {((top + 1).to(REAL) * 2.0**-53).text}")
+    return f"define internal double @uniform(ptr %seed) {{\n{c}\n}}"
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -101,25 +119,16 @@ def _turns(module: Module) -> str:
         fine = fine & (c.get(place, REAL) > 0.0)
     c.do(f"ret i1 {(~fine).text}")
     head = "i64 %n, ptr %af, ptr %al, ptr %as, ptr %bf, ptr %bl, ptr %bs"
-    return f"define internal i1 @turns({head}) {{\n{c}\n}}"
+    return f"define internal i1 @turns({head}) noinline {{\n{c}\n}}"
 
 
-def _uniform(module: Module) -> str:
-    """A number above 0 and up to 1, by xoshiro256++."""
+def _copied(module: Module) -> str:
+    """A vector to another place: one function, since its loop would else be compiled wherever it is used."""
     c = Code(module)
-    s = [c.load("%seed", k, WHOLE) for k in range(4)]
-
-    def rotated(x: Number, by: int) -> Number:
-        return c.call("llvm.fshl.i64", x, x, c.number(by, WHOLE), kind=WHOLE)
-
-    found = rotated(s[0] + s[3], 23) + s[0]
-    t = s[1].shifted(17)
-    third, fourth = s[2] ^ s[0], s[3] ^ s[1]
-    for k, value in enumerate((s[0] ^ fourth, s[1] ^ third, third ^ t, rotated(fourth, 45))):
-        c.store("%seed", k, value)
-    top = c.op(WHOLE, f"lshr i64 {found.text}, 11")
-    c.do(f"ret double {((top + 1).to(REAL) * 2.0**-53).text}")
-    return f"define internal double @uniform(ptr %seed) {{\n{c}\n}}"
+    n = Number(c, "%n", WHOLE)
+    c.loop(n, lambda i: c.store("%to", i, c.load("%from", i, REAL)))
+    c.do("ret void")
+    return f"define internal void @copied(i64 %n, ptr noalias %from, ptr noalias %to) noinline {{\n{c}\n}}"
 
 
 class _Text:
@@ -175,7 +184,7 @@ class _Text:
         self.c.loop(self.n, body)
 
     def _copy(self, source: str, target: str) -> None:
-        self._each(lambda i: self.c.store(target, i, self.c.load(source, i, REAL)))
+        self.c.do(f"call void @copied(i64 {self.n.text}, ptr {source}, ptr {target})")
 
     def _drawn(self) -> Number:
         """The logarithm of a uniform number."""

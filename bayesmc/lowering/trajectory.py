@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import ctypes
 import math
 import os
@@ -113,11 +114,8 @@ class Trajectories:
         arrays = (*place, momenta, step, root, seeds, told)
         addresses = [address_of(a) for a in arrays]
         fallback = _callback(ask, size, failed)
-        parts = [chains * k // threads for k in range(threads + 1)]
 
         def part(first: int, last: int) -> None:
-            if first == last:
-                return
             direct, table = 0, np.zeros(1, np.uintp)
             kept: list[np.ndarray] = []  # lives as long as the call
             if self._way is not None:
@@ -128,10 +126,7 @@ class Trajectories:
             self._run(*wholes, *pointers, *addresses)
             del kept, table
 
-        if threads == 1:
-            part(0, chains)
-        else:
-            list(_pool(threads).map(part, parts[:-1], parts[1:]))
+        shared(part, chains, threads)
         del held
         if failed[0] is not None:
             raise failed[0]
@@ -149,6 +144,21 @@ class Trajectories:
             held.append(np.ascontiguousarray(np.broadcast_to(array, (chains, *node.shape))))
             row[:] = place, address_of(held[-1]), dtype.itemsize * math.prod(node.shape)
         return moving, held
+
+
+def shared(part: Callable[[int, int], None], chains: int, threads: int) -> None:
+    """``part(first, last)`` of chains that threads share, with what the caller has set (``np.errstate``)."""
+    if threads == 1:
+        part(0, chains)
+        return
+    ends = [chains * k // threads for k in range(threads + 1)]
+    parts = [(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True) if a < b]
+    settings = [contextvars.copy_context() for _ in parts]  # what C asks Python runs in these
+
+    def run(own: contextvars.Context, ends: tuple[int, int]) -> None:
+        own.run(part, *ends)
+
+    list(_pool(threads).map(run, settings, parts))
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """Loops of particle filters over all particles, which no element-wise expression says.
 
-Weights from their logs with their sums in one pass, and systematic resampling: the same numbers, to
-rounding, as ``resampling.systematic`` gives.
+Weights from their logs with their sums in one pass, and resampling: the same numbers, to rounding, as
+``resampling.systematic`` and ``stratified`` give.
 
 References
 ----------
@@ -11,88 +11,24 @@ Carpenter, Clifford and Fearnhead (1999), IEE Proceedings F 146; Murray, Lee and
 
 from __future__ import annotations
 
-import ctypes
-import threading
-from collections.abc import Callable
-from functools import lru_cache
-
-import numpy as np
-
 from bayesmc.lowering.code import REAL, WHOLE, Code, Module, Number
 from bayesmc.lowering.elementary import elementary
-from bayesmc.lowering.machine import Loaded, loaded
 
 #: sums of weights between which their scale does not matter
-_SMALL, _LARGE = 1e-200, 1e200
+SMALL, LARGE = 1e-200, 1e200
 
 
-class WeightLoops:
-    """The loops, compiled once."""
-
-    def __init__(self) -> None:
-        whole, real, pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-        self._code = code = _loaded()  # the functions live as long as this
-        self._exponentials = code.function("exponentials", None, whole, real, *[pointer] * 3)
-        self._running = code.function("running", real, whole, *[pointer] * 2)
-        self._ancestors = code.function(
-            "ancestors", None, whole, whole, real, real, real, *[pointer] * 2
-        )
-        self._own = threading.local()
-
-    def exponentials(
-        self, log: np.ndarray, level: float, weights: np.ndarray
-    ) -> tuple[float, float]:
-        """Fill ``exp(log - level)``: its sum, and the sum of its squares. Arrays are in C order."""
-        sums = np.empty(2)
-        self._exponentials(len(log), level, log.ctypes.data, weights.ctypes.data, sums.ctypes.data)
-        return float(sums[0]), float(sums[1])
-
-    def systematic(
-        self, weights: np.ndarray, draws: int, uniform: Callable[[], float]
-    ) -> np.ndarray | None:
-        """What ``resampling.systematic`` gives; None where the weights want another scale, or are none.
-
-        Parameters
-        ----------
-        weights : ndarray, shape (n,)
-            Not negative.
-        draws : int
-        uniform : callable
-            Draws the shift; not called where the answer is None.
-        """
-        running = self._room(len(weights))
-        total = self._running(len(weights), weights.ctypes.data, running.ctypes.data)
-        if not _SMALL < total < _LARGE:
-            return None
-        scale, shift = draws / total, (1.0 - uniform()) % 1.0
-        found = np.zeros(draws + 1, np.int64)
-        last = float(running[-1] * scale + shift)
-        self._ancestors(
-            len(weights), draws, scale, shift, last, running.ctypes.data, found.ctypes.data
-        )
-        return found[:draws]
-
-    def _room(self, size: int) -> np.ndarray:
-        """Each thread's own: fresh memory costs the machine a page at a time."""
-        held = getattr(self._own, "running", None)
-        if held is None or len(held) != size:
-            held = self._own.running = np.empty(size)
-        return held
-
-
-@lru_cache(maxsize=1)
-def weight_loops() -> WeightLoops:
-    """The loops, where there is a compiler."""
-    return WeightLoops()
+def loops(module: Module) -> list[str]:
+    """Functions ``exponentials`` and ``running``; ``systematic`` and ``stratified``, which give ancestors."""
+    return [
+        _exponentials(module),
+        _running(module),
+        _ancestors(module, "systematic"),
+        _ancestors(module, "stratified"),
+    ]
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _loaded() -> Loaded:
-    module = Module()
-    texts = [_exponentials(module), _running(module), _ancestors(module)]
-    return loaded("\n".join([str(module), *texts]), module.foreign)
 
 
 def _exponentials(module: Module) -> str:
@@ -130,17 +66,25 @@ def _running(module: Module) -> str:
     return f"define double @running({head}) {{\n{c}\n}}"
 
 
-def _ancestors(module: Module) -> str:
-    """Every particle writes its number where its offspring begin; a running maximum fills the rest."""
+def _ancestors(module: Module, name: str) -> str:
+    """Every particle writes its number where its offspring begin; a running maximum fills the rest.
+
+    The comb is shifted by one number, or the point of each stratum by its own (one more is beyond reach).
+    """
     c = Code(module)
     draws = Number(c, "%draws", WHOLE)
-    scale, shift, last = (Number(c, f"%{n}", REAL) for n in ("scale", "shift", "last"))
+    scale, last = Number(c, "%scale", REAL), Number(c, "%last", REAL)
+    is_comb = name == "systematic"
     start = c.variable(c.number(0, WHOLE))
 
     def begin(i: Number) -> None:
         c.store("%found", c.get(start, WHOLE), i)
-        position = c.load("%running", i, REAL) * scale + shift
+        position = c.load("%running", i, REAL) * scale
+        position = position + Number(c, "%shift", REAL) if is_comb else position
         edge = position.to(WHOLE)
+        if not is_comb:
+            point = c.load("%points", c.where(edge > draws, draws, edge), REAL)
+            edge = edge + (position - edge.to(REAL) > point).to(WHOLE)
         is_end = (position >= last) | (edge > draws)
         c.set(start, c.where(is_end, draws, edge))
 
@@ -155,5 +99,6 @@ def _ancestors(module: Module) -> str:
 
     c.loop(draws, fill)
     c.do("ret void")
-    head = "i64 %n, i64 %draws, double %scale, double %shift, double %last"
-    return f"define void @ancestors({head}, ptr noalias %running, ptr noalias %found) {{\n{c}\n}}"
+    more = "double %shift" if is_comb else "ptr noalias %points"
+    head = f"i64 %n, i64 %draws, double %scale, double %last, {more}, ptr noalias %running"
+    return f"define void @{name}({head}, ptr noalias %found) {{\n{c}\n}}"

@@ -277,7 +277,9 @@ def as_one_child(blanket: Blanket, children: Sequence[Child]) -> tuple[LikeTerms
     terms = like_terms(blanket.target, [c.term for c in children])
     first = children[0].relation
     rows = tuple(np.concatenate(r) for r in zip(*(c.relation.rows for c in children), strict=True))
-    relation = replace(first, term_plates=(GROUP, *first.term_plates), rows=rows, _kept={})
+    relation = replace(
+        first, term_plates=(GROUP, *first.term_plates), rows=rows, place=None, _kept={}
+    )
     term = terms.term
     if relation.kind == "lookup" and isinstance(term, StackedTerm):
         assert term.function is not None and relation.source is not None

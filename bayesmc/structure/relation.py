@@ -60,6 +60,8 @@ class Relation:
         For ``rows``: flat elements of the node, one array over the term's flat elements for every role.
     coupled : tuple of str
         For ``whole``: plates of the node whose elements must be updated in turn.
+    place : Expression or None
+        For a lookup, ``index`` as an expression of stored values.
     """
 
     kind: str
@@ -70,6 +72,7 @@ class Relation:
     index: Callable[[Mapping[str, np.ndarray]], np.ndarray] | None = None
     rows: tuple[np.ndarray, ...] = ()
     coupled: tuple[str, ...] = ()
+    place: Expression | None = None
     _kept: dict[Any, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -268,7 +271,9 @@ def _looked_up(target: Target, name: str, term: Term, source: str, whole: Relati
     if len(found) != 1:
         return whole
     index = partial(looked_up, Program([found[0]]))
-    return Relation("lookup", node.plates, node.plate_shape, term.plates, source, index)
+    return Relation(
+        "lookup", node.plates, node.plate_shape, term.plates, source, index, place=fixed[0]
+    )
 
 
 def positions(target: Target, result: Any, source: str, shape: Shape) -> tuple[Expression, ...]:

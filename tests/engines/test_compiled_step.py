@@ -13,7 +13,7 @@ from bayesmc.engines import slice_densities
 from bayesmc.engines.particles import compiled_step
 from bayesmc.errors import BayesmcError
 from bayesmc.expression import elementwise
-from bayesmc.lowering import machine, writer
+from bayesmc.lowering import machine, series, writer
 
 pytest.importorskip("llvmlite", reason="llvmlite is not installed")
 
@@ -80,8 +80,20 @@ def lagged() -> tuple[Any, dict[str, Any]]:
     return dbn, {"y": np.random.default_rng(3).normal(0.0, 2.0, size=30)}
 
 
+def families() -> tuple[Any, dict[str, Any]]:
+    """Hidden nodes that are drawn by uniform numbers, or folded; a vector that is seen."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Laplace(0.8 * x_prev, 0.5), initial=bmc.Laplace(0.0, 1.0))
+    dbn.add("u", lambda x: bmc.Uniform(np.minimum(x, 0.0) - 1.0, np.abs(x)))
+    dbn.add("h", lambda h_prev: bmc.HalfNormal(0.5 + 0.3 * h_prev), initial=bmc.HalfNormal(1.0))
+    cov = np.array([[0.5, 0.2], [0.2, 0.4]])
+    dbn.add("y", lambda x, u, h: bmc.MvNormal(bmc.stack([x + u, h - u], axis=-1), cov))
+    return dbn, {"y": np.random.default_rng(4).normal(0.0, 1.0, size=(25, 2))}
+
+
 MODELS: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
     "growth": growth, "several": several, "vector": vector, "lagged": lagged,
+    "families": families,
 }  # fmt: skip
 
 
@@ -89,7 +101,9 @@ def passed(name: str, monkeypatch: pytest.MonkeyPatch, code: bool, **options: An
     made: list[compiled_step.SliceCode] = []
     kind, read = compiled_step.SliceCode, options.pop("read", False)
     with monkeypatch.context() as patch:
-        patch.setattr(compiled_step, "SliceCode", lambda step: made.append(kind(step)) or made[-1])
+        patch.setattr(
+            compiled_step, "SliceCode", lambda *a, **k: made.append(kind(*a, **k)) or made[-1]
+        )
         patch.setattr(compiled_step, "_WORTH", 0.0 if code else np.inf)
         patch.setattr(compiled_step, "_READ", 0 if read else np.inf)
         dbn, seen = MODELS[name]()
@@ -113,9 +127,11 @@ def test_means_agree_in_every_slice(
         missing = "drawn from a family without machine code"  # counts that are not seen
         assert all(missing in why for why in code.refused.values())
         assert sum(made is not None for made in code._made.values()) >= 2
-        for node in {"several": ("level", "scale", "both"), "lagged": ("x", "b", "l")}.get(
-            name, "x"
-        ):
+        for node in {
+            "several": ("level", "scale", "both"),
+            "lagged": ("x", "b", "l"),
+            "families": ("x", "u", "h"),
+        }.get(name, "x"):
             np.testing.assert_allclose(fast.mean(node), plain.mean(node), rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(fast.var(node), plain.var(node), rtol=1e-8, atol=1e-9)
         assert fast.log_marginal_likelihood == pytest.approx(
@@ -194,13 +210,13 @@ def test_planted_faults_leave_it_to_the_plain_steps(
             slice_densities, "_draw", lambda n, f, z: draw(n, f, elementwise(np.multiply, z, 1.001))
         )
     else:
-        call = compiled_step._Slice.__call__
+        call = series.SliceCall.__call__
 
-        def turned(self: Any, row: Any, before: Any, selection: Any, rng: Any) -> Any:
-            rows = np.roll(np.arange(selection.particles), 1)
-            return call(self, row, before, selection._replace(ancestors=rows), rng)
+        def turned(self: Any, least: float, cloud: Any, *args: Any) -> Any:
+            rows = np.roll(np.arange(len(cloud.log)), 1)
+            return call(self, least, cloud._replace(rows=rows), *args)
 
-        monkeypatch.setattr(compiled_step._Slice, "__call__", turned)
+        monkeypatch.setattr(series.SliceCall, "__call__", turned)
     fast, code = passed("growth", monkeypatch, True)
     assert "other particles" in str(code.refused)
     np.testing.assert_allclose(fast.mean("x"), plain.mean("x"), rtol=1e-9, atol=1e-9)
@@ -235,8 +251,8 @@ def test_explain_says_what_makes_the_slices(monkeypatch: pytest.MonkeyPatch) -> 
     dbn, seen = finite()
     told = bmc.explain(dbn, seen, engine=engine, question="filter").effort
     assert told == "slices in NumPy: node 'k' is drawn from a family without machine code"
-    stratified = bmc.ParticleFilter(500, resampling="stratified")
-    told = bmc.explain(*growth(), engine=stratified, question="filter").effort
+    other = bmc.ParticleFilter(500, resampling="residual")
+    told = bmc.explain(*growth(), engine=other, question="filter").effort
     assert told == "slices as machine code, but for resampling"
     guided = bmc.ParticleFilter(500, proposal={"x": lambda y: bmc.Normal(y, 9.0)})
     told = bmc.explain(*growth(), engine=guided, question="filter").effort

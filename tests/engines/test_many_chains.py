@@ -179,6 +179,21 @@ def test_stopping_does_not_bend_the_mean(monkeypatch: pytest.MonkeyPatch) -> Non
 # ---- starts, warmup ------------------------------------------------------------------------------
 
 
+def test_a_rare_state_does_not_hold_a_warmup(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It differs in one draw, which is not among those that are looked at."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("rare", bmc.Bernoulli(0.001))
+    x = np.random.default_rng(0).normal(size=(16, 200))
+    rare = np.zeros((16, 200), int)
+    rare[3, 101] = 1
+    monkeypatch.setattr(length, "_WINDOW", 800)
+    assert length.forgotten({"x": x, "rare": rare}, net.model(), 8)
+    assert length.forgotten({"rare": rare}, net.model(), 8)
+    far = x + np.repeat([0.0, 2.0], 8)[:, None]
+    assert not length.forgotten({"x": far, "rare": rare}, net.model(), 8)
+
+
 def test_a_warmup_ends_when_starts_are_forgotten() -> None:
     quick, slow = run(1, phi=0.3)[0], run(1, phi=0.98)[0]
     assert quick.warmup == 100

@@ -22,6 +22,7 @@ NODES = {
     "several": ("level", "scale", "both", "count"),
     "vector": ("x",),
     "lagged": ("x", "b", "l"),
+    "families": ("x", "u", "h"),
 }
 
 

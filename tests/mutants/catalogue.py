@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from tests.mutants import chains, densities, draws, exact, factored, filters, hamiltonian, switching
+from tests.mutants import (
+    chains,
+    densities,
+    draws,
+    exact,
+    factored,
+    filters,
+    hamiltonian,
+    slices,
+    switching,
+)
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -13,5 +23,6 @@ MUTANTS: tuple[Mutant, ...] = (
     *switching.MUTANTS,
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
+    *slices.MUTANTS,
     *densities.MUTANTS,
 )

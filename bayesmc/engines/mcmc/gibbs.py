@@ -11,16 +11,14 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
-import numpy as np
-
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
-from bayesmc.engines.mcmc.cost import shares
 from bayesmc.engines.mcmc.jointly import trajectories_of
+from bayesmc.engines.mcmc.plan import Plan
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
-from bayesmc.engines.weighted.drawing import treatment
+from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.accepted import Accepted, finite_kernel, number_kernel
-from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.base import ANYHOW, How, Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
@@ -41,7 +39,7 @@ from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import joint_states, table_kernel, table_kernels
 from bayesmc.network import Problem
-from bayesmc.structure.blanket import Blanket, colours
+from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
@@ -78,7 +76,14 @@ class Gibbs(ChainEngine):
     thinning : int
         Sweeps per kept draw.
     debug : bool
-        Check every conjugate draw against the densities of the model (slow): an error names the node.
+        Check every conjugate draw against the densities of the model, and every move in machine code against
+        that in NumPy (slow): an error names the node.
+    compiled : bool, optional
+        Whether slices and trajectories are machine code, which needs the extra `[fast]`: always, never, or by
+        default where the sweeps of the warmup would take longer in NumPy than compiling. `explain` says of
+        each node what it is, and why; what has no machine code goes on in NumPy.
+    threads : int
+        Threads that share the chains in machine code; the answer is the same.
     ess : float
         Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
@@ -108,15 +113,23 @@ class Gibbs(ChainEngine):
     chains: int | None = None
     thinning: int = 1
     debug: bool = False
+    compiled: bool | None = None
+    threads: int = field(default=1, compare=False, repr=False)
     ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Gibbs sampling"
     judges: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count(self, "threads", self.threads, "2")
+        if self.compiled not in (None, True, False):
+            raise ValueError(f"Gibbs(compiled={self.compiled!r}): compiled is True, False or None")
+
     def refusal(self, problem: Problem) -> str | None:
         def planned(problem: Problem) -> None:
-            plan_of(problem, self.debug)
+            self._plan(problem)
 
         return refused(problem, "Gibbs", "has no kernel for this net", planned)
 
@@ -124,112 +137,36 @@ class Gibbs(ChainEngine):
         return {row.node: str(row) for row in self.table(problem)}
 
     def table(self, problem: Problem) -> list[Treatment]:
-        return plan_of(problem, self.debug).table()
+        lengths = self.lengths(problem)
+        return self._plan(problem).table(lengths.warmup, lengths.chains)
 
     def tied(self, problem: Problem) -> Sequence[str]:
-        return plan_of(problem, self.debug).constraints
+        return self._plan(problem).constraints
 
     def sampler(self, problem: Problem) -> SweepSampler:
-        plan = plan_of(problem, self.debug)
+        plan = self._plan(problem)
         sampler = SweepSampler(plan.target, plan.kernels)
         sampler.climbs = any(_is_slice(k) for k in plan.kernels)
         return sampler
 
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """The kernels of a sweep.
-
-    Attributes
-    ----------
-    kernels : list of Kernel
-        In the order of a sweep: children before parents.
-    refusals : dict
-        Node -> why it has no closed form.
-    constraints : tuple of str
-        Nodes among which zeros in tables may keep a chain from reaching every configuration.
-    """
-
-    problem: Problem
-    target: Target
-    blankets: Mapping[str, Blanket] = field(default_factory=dict)
-    kernels: list[Kernel] = field(default_factory=list)
-    refusals: dict[str, str] = field(default_factory=dict)
-    constraints: tuple[str, ...] = ()
-
-    def table(self) -> list[Treatment]:
-        """What happens to each node."""
-        model = self.problem.model
-        by_name: dict[str, list[Kernel]] = {}
-        for kernel in self.kernels:
-            for name in kernel.names:
-                by_name.setdefault(name, []).append(kernel)
-        number, cost = self._colours(), shares(self.kernels, self.target)
-        rows = []
-        for name, node in model.nodes.items():
-            plates = ", ".join(f"{p}={model.sizes[p]}" for p in node.plates)
-            if name not in by_name:
-                forward = name in self.target.forward and node.is_stochastic
-                barren = forward and self.target.seen(name) is None
-                why = "nothing observed depends on it" if barren else self._given(name)
-                rows.append(Treatment(name, "forward" if barren else "", why, plates))
-                continue
-            kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
-            why = "; then ".join(dict.fromkeys(w for w in words if w))
-            if name in self.refusals:
-                why += f"{', ' if why else ''}since {self.refusals[name]}"
-            classes = len(self.blankets[name].classes)
-            colour = f"{number[name]}" + (f" (elements: {classes})" if classes > 1 else "")
-            kinds_told = " + ".join(dict.fromkeys(kinds))
-            rows.append(Treatment(name, kinds_told, why, plates, colour, cost.get(name, 0.0)))
-        return rows
-
-    def _given(self, name: str) -> str:
-        """What is said of a node that no kernel moves."""
-        seen = self.target.seen(name)
-        if seen is None:
-            return treatment(self.problem, name)
-        return "observed" if seen.mask is None else "observed in part; the rest is drawn forward"
-
-    def in_short(self) -> str:
-        """How many nodes each kind of kernel moves."""
-        kinds: dict[str, set[str]] = {}
-        for kernel in self.kernels:
-            for name in kernel.names:
-                kinds.setdefault(kernel.words(name)[0], set()).add(name)
-        return ", ".join(f"{kind} ({len(names)})" for kind, names in kinds.items())
-
-    def _colours(self) -> dict[str, int]:
-        """Colour of every chain node: those of one colour share no factor."""
-        chain = self.target.chain
-        place = {n: i for i, n in enumerate(chain)}
-        edges = set()
-        for term in self.target.terms.values():
-            inside = self._entering(term.scope)
-            edges |= {(place[a], place[b]) for a in inside for b in inside if place[a] < place[b]}
-        found = colours(len(chain), np.array(sorted(edges), dtype=np.intp).reshape(-1, 2))
-        return {chain[i]: c for c, members in enumerate(found, 1) for i in members}
-
-    def _entering(self, scope: Sequence[str]) -> set[str]:
-        """Chain nodes that reach a scope, through deterministic nodes as well."""
-        found: set[str] = set()
-        todo = list(scope)
-        while todo:
-            name = todo.pop()
-            if name in self.blankets:
-                found.add(name)
-            elif name in self.target.links:
-                todo += self.problem.model[name].parents
-        return found
+    def _plan(self, problem: Problem) -> Plan:
+        return plan_of(problem, self.debug, how=How(self.compiled, self.threads))
 
 
-def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None = None) -> Plan:
+def plan_of(
+    problem: Problem,
+    debug: bool = False,
+    only: Collection[str] | None = None,
+    how: How = ANYHOW,
+) -> Plan:
     """The plan for a posed problem, made once.
 
     Parameters
     ----------
     only : collection of str, optional
         Nodes that the plan is to move; the rest of the chain is moved by others. By default all of it.
+    how : How
+        What of it is machine code.
 
     Examples
     --------
@@ -243,18 +180,18 @@ def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None 
     >>> [kernel.names for kernel in plan_of(pose(net, {"seen": 3}), only=("rate",)).kernels]
     [('rate',)]
     """
-    key = f"gibbs plan, debug={debug}"
+    key = f"gibbs plan, debug={debug}, {how}"
     if only is not None:
         key += f", only {sorted(only)}"
     if key not in problem.cache:
-        problem.cache[key] = _planned(problem, debug, only)
+        problem.cache[key] = _planned(problem, debug, only, how)
     return problem.cache[key]
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Plan:
+def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: How) -> Plan:
     target = target_of(problem)
     names = tuple(n for n in target.chain if only is None or n in only)
     blankets = {name: Blanket(target, name) for name in names}
@@ -275,10 +212,13 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     governed = {n for scales in scales_of for n in scales}
     closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]
     keys = {n: forms.key(blankets[n]) for n in refusals} if len(refusals) >= FEWEST else {}
-    joint = trajectories_of(problem, refusals, closed, governed, keys, debug) if refusals else []
+    joint = (
+        trajectories_of(problem, refusals, closed, governed, keys, debug, how) if refusals else []
+    )
     moved = {n for k in joint for n in k.names}
     kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
-    kernels += [*joint, *_numbers(blankets, forms, [n for n in refusals if n not in moved], debug)]
+    left = [n for n in refusals if n not in moved]
+    kernels += [*joint, *_numbers(blankets, forms, left, debug, how)]
     for block, scales in zip(blocks, scales_of, strict=True):
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
@@ -289,7 +229,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     slow = [n for k in kernels if _is_slice(k) for n in k.names]
     moved = set(names)
     if slow:
-        kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
+        found = rescaled_kernels(target, slow, how=how, debug=debug)
+        kernels += [k for k in found if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets, kernels)
     if slow and may_be_drawn_anew(target, names):
         every = _SELDOM if any(isinstance(k, Hamiltonian) for k in kernels) else 1
@@ -324,7 +265,8 @@ def _conjugate(
 
 def _is_slice(kernel: Kernel) -> bool:
     if isinstance(kernel, Accepted):
-        return not kernel.constraints and _is_slice(kernel.other)
+        other = kernel.other
+        return other is not None and not kernel.constraints and _is_slice(other)
     return isinstance(
         kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice, Hamiltonian)
     )
@@ -390,7 +332,7 @@ def _mixture_label(target: Target, blanket: Blanket, debug: bool) -> Labels | No
 
 
 def _numbers(
-    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool
+    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool, how: How
 ) -> list[Kernel]:
     """Kernels of nodes without a closed form that have too many values to try."""
     target = forms.target
@@ -404,12 +346,13 @@ def _numbers(
         else:
             kernels.append(AdaptiveWalk(blankets[name]))
     stacked, left = stacks(target, blankets, left, forms)
-    kernels += [Stacked(group, partial(Slice, debug=debug)) for group in stacked]
+    alike = partial(Slice, debug=debug, how=how, reads_data=True)
+    kernels += [Stacked(group, alike) for group in stacked]
     for group in _together(target, blankets, left):
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
             left = [n for n in left if n not in group]
-    return kernels + [number_kernel(blankets[n], debug) for n in left]
+    return kernels + [number_kernel(blankets[n], debug, how) for n in left]
 
 
 def _kind(target: Target, blanket: Blanket) -> str:

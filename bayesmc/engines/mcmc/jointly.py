@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 
 from bayesmc.errors import UnsupportedError
+from bayesmc.kernels.base import ANYHOW, How
 from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.network import Problem
@@ -63,6 +64,7 @@ def trajectories_of(
     alone: Collection[str] = (),
     keys: Mapping[str, Hashable] | None = None,
     debug: bool = False,
+    how: How = ANYHOW,
 ) -> list[Hamiltonian]:
     """Kernels of nodes without a closed form that move better together than one at a time.
 
@@ -85,6 +87,8 @@ def trajectories_of(
         What is equal for like nodes, which slices move as one (``structure.stacked.Forms.key``).
     debug : bool
         Compare machine code with NumPy at every step.
+    how : How
+        Whether trajectories are machine code.
 
     Examples
     --------
@@ -108,7 +112,15 @@ def trajectories_of(
             metric: Metric = "dense" if density.size <= DENSE else "diagonal"
             match = f"{density.size} free numbers jointly, {metric} metric"
             kernels.append(
-                Hamiltonian(density, density.others, metric=metric, match=match, debug=debug)
+                Hamiltonian(
+                    density,
+                    density.others,
+                    metric=metric,
+                    match=match,
+                    threads=how.threads,
+                    compiled=how.compiled,
+                    debug=debug,
+                )
             )
     return kernels
 

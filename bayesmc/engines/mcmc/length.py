@@ -121,7 +121,12 @@ def forgotten(stored: Mapping[str, np.ndarray], model: Model, superchains: int) 
     chains, count = columns[0].shape
     every = min(-(-len(columns) * chains * count // _WINDOW), max(count // _FEW, 1))
     some = -(-len(columns) * chains * (count // every) // _WINDOW)
-    draws = np.stack([column[:, ::every] for column in columns[::some]], axis=-1)
+    looked = [column[:, ::every] for column in columns[::some]]
+    # a state that is rare may differ in what is left out alone: nothing is known of it
+    looked = [column for column in looked if (column != column[0, 0]).any()]
+    if not looked:
+        return True
+    draws = np.stack(looked, axis=-1)
     half = draws.shape[1] // 2
     times = np.concatenate([draws[:, :half], draws[:, -half:]])  # the early ones as a superchain
     figures = diagnostics.chain_figures(draws, superchains=superchains)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.engines.averages import as_event, called
 from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors
+from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.errors import QueryError, UnknownNodeError
@@ -66,6 +66,37 @@ class Answers(NamedTuple):
                 "of its own; use var, or expectation of a product"
             )
         return np.stack([self._covariance(p, names) for p in self.particles])
+
+    def node_errors(
+        self, nodes: Sequence[CompiledNode], filtered: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Errors of nodes of trajectories: infinite where the filter's are."""
+        assert self.sharing is not None
+        block, found = Block(self.layout, self.particles, whole=True), {}
+        for node in nodes:
+            errors = node_errors(self.sharing, block, node)
+            found[node.name] = np.where(np.isinf(filtered[node.name]), np.inf, errors)
+        return found
+
+    def stacked(self, node: CompiledNode) -> np.ndarray:
+        """Particles of all slices, shape ``(slices, particles, *plates, *event)``."""
+        shape = (self.layout.particles, *node.value_shape)
+        rows = [np.broadcast_to(p.values[node.name], shape) for p in self.particles]
+        return np.array(node.decode(np.stack(rows)), subok=True)
+
+    def weights(self) -> np.ndarray:
+        """Normalised weights of all slices."""
+        return np.stack([p.weights / p.total for p in self.particles])
+
+    def ancestors(self) -> np.ndarray:
+        """Positions of ancestors in the slices before; -1 for particles that were drawn anew."""
+        shape = (self.layout.particles, *self.layout.lead)
+        own = np.arange(shape[0]).reshape((-1,) + (1,) * len(self.layout.apart))
+        rows = []
+        for p in self.particles:
+            found = own if p.ancestors is None else p.ancestors
+            rows.append(np.broadcast_to(np.where(p.rejuvenated, -1, found), shape))
+        return np.stack(rows)
 
     # ---- private -------------------------------------------------------------------------------
 

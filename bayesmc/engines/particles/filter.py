@@ -111,6 +111,11 @@ class ParticleFilter(FilterEngine):
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
+    compiled : bool, optional
+        Whether slices are machine code, which needs the extra `[fast]`: always, never, or by default where
+        the series would take more than a tenth of a second in NumPy, or where machine code of an earlier run
+        is at hand and saves more than loading it takes. The particles are the same to rounding. `explain`
+        says what is not, and why.
     budget : int
         Particles times slices (times elements of plates that are filtered separately) that this may take:
         seconds. With ``proposal="optimal"`` or ``auxiliary=True`` each counts as 20, which is about what a
@@ -177,6 +182,7 @@ class ParticleFilter(FilterEngine):
     adapt: KLD | None = None
     recovery: Recovery | None = None
     tolerance: float = TOLERANCE
+    compiled: bool | None = None
     budget: int = BUDGET
 
     label: ClassVar[str] = "particle filter"
@@ -189,6 +195,10 @@ class ParticleFilter(FilterEngine):
         check_numbers(self)
         scheme_of(self.resampling)
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
+        if self.compiled not in (None, True, False):
+            raise ValueError(
+                f"ParticleFilter(compiled={self.compiled!r}): give True, False or None"
+            )
         check_kind("adapt", self.adapt, KLD)
         check_kind("recovery", self.recovery, Recovery)
         if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
@@ -247,7 +257,7 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static)
-        return told(step, problem, self.resampling == "systematic")
+        return told(step, problem, self.compiled)
 
     def filter(
         self,
@@ -389,7 +399,7 @@ class ParticleFilter(FilterEngine):
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
         step = self.step_of(problem.slices, problem.known_static, kept)
-        step = compiled_step(step, problem.steps, self.resampling == "systematic")
+        step = compiled_step(step, problem.steps, self.compiled)
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _sized(self, particles: int) -> ParticleFilter:

@@ -80,8 +80,11 @@ class FilterStep(SMCStep):
 
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
         before, selection = self.chosen(earlier, row, rng)
-        made = None if self.machine is None else self.machine(row, before, selection, rng)
-        values, log = made or self.propagated(self.steps(row), row, before, selection, rng)
+        if self.machine is not None:
+            made: Particles | None = self.machine(row, before, selection, rng)
+            if made is not None:
+                return made
+        values, log = self.propagated(self.steps(row), row, before, selection, rng)
         averages, injected = None, 0
         if self.injection is not None and earlier is not None:
             passed = values, log
@@ -123,12 +126,6 @@ class FilterStep(SMCStep):
         if needed < most:
             chosen = self.resample(earlier.weights, needed, rng)
         return Selection(needed, chosen, True, 0.0, math.log(needed))
-
-    def exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
-        if self.machine is None or log.ndim > 1 or not log.flags.c_contiguous:
-            return super().exponentials(log, level)
-        weights = self.room(log.shape)
-        return weights, *self.machine.exponentials(log, level, weights)
 
     def recycle(self, particles: Particles) -> None:
         if self.counts is None:

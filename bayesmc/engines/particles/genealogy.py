@@ -66,14 +66,24 @@ SEEMS = 2.8
 
 def rested(now: Particles) -> Any:
     """Whether a slice rests on particles enough for its error to be told."""
-    return now.ess >= min(RESTS, 0.9 * len(now.weights))
+    return now.ess >= rests(len(now.weights))
+
+
+def rests(particles: int) -> float:
+    """Equally weighted particles on which a slice of so many must rest for its error to be told."""
+    return min(RESTS, 0.9 * particles)
+
+
+def level_of(particles: int) -> float:
+    """Variance between two looks above which it matters where it comes from."""
+    return min(max(UNEVEN / particles, MATTERS[0]), MATTERS[1])
 
 
 def begun(now: Particles, layout: Layout) -> Families:
     """Families of the particles of the first slice, which were drawn independently."""
     n, lead = layout.particles, layout.lead
     groups = min(GROUPS, max(n // LEAST, 2), n)
-    bounds, shares = _even(len(now.weights), groups, len(lead))
+    bounds, shares = even_groups(len(now.weights), groups, len(lead))
     return Families(
         np.array(np.broadcast_to(bounds, (2, groups + 1, *lead))),
         np.array(np.broadcast_to(shares, (2, groups, *lead))),
@@ -131,6 +141,17 @@ def unremarkable(
     return bounds, explained
 
 
+@lru_cache(maxsize=64)
+def even_groups(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Groups of about as many particles: where they begin and end, and their shares."""
+    bounds = np.arange(groups + 1) * n // groups
+    tail = (1,) * axes
+    found = bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
+    for array in found:
+        array.flags.writeable = False
+    return found
+
+
 def evidence_error(families: Families, now: Particles) -> Any:
     """Root mean square error of the log evidence, with its bias of minus half its variance."""
     off = _off(families, _weights(families, now))
@@ -167,17 +188,6 @@ def family_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=64)
-def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Groups of about as many particles: where they begin and end, and their shares."""
-    bounds = np.arange(groups + 1) * n // groups
-    tail = (1,) * axes
-    found = bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
-    for array in found:
-        array.flags.writeable = False
-    return found
 
 
 def _moved(families: Families, earlier: Particles, now: Particles, steady: bool) -> Families:
@@ -224,7 +234,7 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
     resampled = np.asarray(now.resampled)
     variance = _variance(families, off)
     edge = np.zeros(resampled.shape, dtype=bool)
-    if variance.max() > _level(n):
+    if variance.max() > level_of(n):
         at_edge, odd = _at_edge(families, variance, off, families.explained, n)
         if odd.any():
             edge, doubted = resampled & at_edge, np.where(resampled & odd, now.t, families.doubted)
@@ -246,7 +256,7 @@ def _matters(
     families: Families, explained: np.ndarray, now: Particles, counts: np.ndarray, off: np.ndarray
 ) -> bool:
     """Whether anything is due, or seems odd, in a filter without plates: the same in Python's numbers."""
-    level, age = _level(len(now.weights)), now.t - int(families.born[YOUNG])
+    level, age = level_of(len(now.weights)), now.t - int(families.born[YOUNG])
     shares, far = _square(families.shares, 1).tolist(), _square(off, 1).tolist()
     few = shares[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
     if age > LONGEST or (age > SHORTEST and few):
@@ -269,7 +279,7 @@ def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Fa
 def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bool) -> Families:
     """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
     groups = families.shares.shape[1]
-    fresh: Any = (*_even(len(now.weights), groups, now.weights.ndim - 1), 0.0, 0.0, now.t)
+    fresh: Any = (*even_groups(len(now.weights), groups, now.weights.ndim - 1), 0.0, 0.0, now.t)
     found: list[Any] = []
     for value, new in zip(families[:5], fresh, strict=True):
         begun = np.empty_like(value)
@@ -348,7 +358,7 @@ def _at_edge(
     Many of them must where rows do not pull the same way: a few are an accident.
     """
     every, bounded = explained[:, 0], explained[:, 1]
-    odd = (variance > _level(n)) & (variance > EDGE * every)
+    odd = (variance > level_of(n)) & (variance > EDGE * every)
     odd |= (variance > LONG) & (variance > EDGE * bounded)
     far = variance > MOST
     either = (odd | far).any(axis=0)
@@ -358,8 +368,3 @@ def _at_edge(
     by = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
     some = np.where(families.drift.worst < SEEMS, SOME, np.inf)
     return ((odd & (by < some)) | far).any(axis=0), either
-
-
-def _level(n: int) -> float:
-    """Variance between two looks above which it matters where it comes from."""
-    return min(max(UNEVEN / n, MATTERS[0]), MATTERS[1])

@@ -38,6 +38,8 @@ LOOKS, EVERY = 8, 12
 MORE, SHARE = 4, 0.2
 #: the same where rows are wide, such as scans, which are dear to draw; and from how many numbers on they are
 WIDE_LOOKS, WIDE_EVERY, WIDE = 16, 32, 16
+#: the judges of the row that came, and of each one drawn
+_JUDGES = np.tile(np.arange(ROWS, ROWS + JUDGES), ROWS + 1)
 #: and rows below which none is: too few for any conclusion
 _FEW = 5
 
@@ -130,8 +132,7 @@ class Replicates:
                 taken = along_plates(value, chosen, node.plates, self.plan.apart)
             else:
                 taken = value[chosen]
-            judges = np.tile(taken[ROWS:], (ROWS + 1, *(1,) * (taken.ndim - 1)))
-            found[name + PREVIOUS] = taken[:ROWS], judges
+            found[name + PREVIOUS] = taken[:ROWS], taken.take(_JUDGES, axis=0)
         return found
 
     def _drawn(self, row: Row, before: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

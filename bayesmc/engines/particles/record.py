@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +22,10 @@ from bayesmc.engines.particles.errors import ByFamily, Variances, function_error
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
+from bayesmc.engines.particles.made import Ahead, MadeSlices
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Layout, Particles, quiet
-from bayesmc.engines.particles.sums import Tally, answers
+from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
@@ -141,6 +141,18 @@ class Record:
         self._written, self._waiting = [*earlier, worked_out], []
         self._tallies, self._figures, self._summed = [], [], []
 
+    def add_made(self, made: MadeSlices) -> None:
+        """Take in slices that were made together, the next ones; all before are written."""
+        assert self.tracker is not None and self.families is not None
+        *earlier, before = self._written
+        families, sums = made.followed(self.tracker, self.families, before.particles[-1])
+        rows: Rows = {what: {} for what in _KINDS} | {"filter": made.diagnosed()}
+        for node, found in made.figures_of(self._nodes, figures(sums)):
+            for what, own in zip(("means", "variances", "errors"), found, strict=True):
+                rows[what][node.name] = own.reshape(-1, *node.value_shape)
+        written = Written(rows, [families], [made.particles(len(made) - 1)])
+        self._written = [*earlier, before._replace(particles=[], families=[]), written]
+
     def _sum(self, now: Particles, row: Row) -> None:
         """Take the sums of a slice."""
         assert self.tracker is not None and self._summing is not None
@@ -188,9 +200,8 @@ class Record:
                 there = [at_scouts(self.layout, p, f, model, function) for p, f in pairs]
                 rows["query errors"][name] = function_errors(by, block, values, there)
         rows["filter"] = diagnosed([figures_of(p) for p in slices], self.layout.lead)
-        return Written(
-            rows, families if self.keep else families[-1:], slices if self.keep else slices[-1:]
-        )
+        kept = slice(None) if self.keep else slice(-1, None)
+        return Written(rows, families[kept], slices[kept])
 
     def posterior(
         self,
@@ -205,10 +216,9 @@ class Record:
         self.write()
         k = self.problem.steps if steps is None else steps
         tables, means, variances = (self._joined(w, k) for w in ("tables", "means", "variances"))
-        seen = observed_answers(self.problem, k)
+        seen, families = observed_answers(self.problem, k), self.families
         if filtered is None:
-            filter, families = self._joined("filter", k), self.families
-            last = self._written[-1].particles[-1]
+            filter, last = self._joined("filter", k), self._written[-1].particles[-1]
             told = None if families is None else evidence_error(families, last)
         else:
             filter, told = filtered.diagnostics, filtered.log_marginal_likelihood_mcse
@@ -242,15 +252,10 @@ class Record:
         self.write()
         assert filtered.mean_errors is not None
         slices = [p for w in self._written for p in w.particles]
-        block, model = Block(self.layout, slices, whole=True), self.problem.model
         rows = self._written[0].rows  # of all slices at once
-        for node in self._nodes:
-            errors = node_errors(sharing, block, node)
-            lost = np.isinf(filtered.mean_errors[node.name])
-            rows["errors"][node.name] = np.where(lost, np.inf, errors)
-        for name, function in self.asked.items():
-            values = [evaluated(self.layout, p, model, function) for p in slices]
-            rows["query errors"][name] = function_errors(sharing, block, values, [])
+        held = Answers(self.layout, self.problem.model, slices, [], sharing)
+        rows["errors"] |= held.node_errors(self._nodes, filtered.mean_errors)
+        rows["query errors"] |= {name: held.mcse(f) for name, f in self.asked.items()}
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
     # ---- private -------------------------------------------------------------------------------
@@ -336,17 +341,12 @@ class FilteredParticles(SeriesPosterior):
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
-        held = self._alike("particles")
-        node = self._node(name)
-        shape = (held.layout.particles, *node.value_shape)
-        rows = [np.broadcast_to(p.values[name], shape) for p in held.particles]
-        return np.array(node.decode(np.stack(rows)), subok=True)
+        return self._alike("particles").stacked(self._node(name))
 
     @property
     def weights(self) -> np.ndarray:
         """Normalised weights of all slices, shape ``(time, particles, *plates)``."""
-        held = self._alike("weights")
-        return np.stack([p.weights / p.total for p in held.particles])
+        return self._alike("weights").weights()
 
     @property
     def ancestors(self) -> np.ndarray:
@@ -354,14 +354,7 @@ class FilteredParticles(SeriesPosterior):
 
         Particles that were drawn anew have none: -1.
         """
-        held = self._alike("ancestors")
-        shape = (held.layout.particles, *held.layout.lead)
-        own = np.arange(shape[0]).reshape((-1,) + (1,) * len(held.layout.apart))
-        rows = []
-        for p in held.particles:
-            found = own if p.ancestors is None else p.ancestors
-            rows.append(np.broadcast_to(np.where(p.rejuvenated, -1, found), shape))
-        return np.stack(rows)
+        return self._alike("ancestors").ancestors()
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
@@ -424,14 +417,18 @@ def filtered_by(
     Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows.
     """
     record = Record(problem, step.layout, queries, keep, Tracker(step))
-    rng, rows = stream(seed, Purpose.FILTER, unit), problem.series
-    check = stream(seed, Purpose.CHECK, unit)
+    rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
     looks = Replicates(problem, step.plan, check) if unit == 0 else None
     now: Particles | None = None
+    is_ahead = step.machine is not None and look_back is None
+    ahead = Ahead(step.machine, problem, record) if is_ahead else None
 
     def move(k: int) -> None:
         nonlocal now
-        row, old = rows.row(k), now
+        if ahead is not None and ahead.reaches(k, now, rng):
+            now = ahead.passed(k, looks)
+            return
+        row, old = problem.series.row(k), now
         if looks is not None:
             looks.look(k, old, row)
         now = step(old, row, rng)
@@ -443,7 +440,11 @@ def filtered_by(
         if old is not None and not keep and look_back is None and record.is_written:
             step.recycle(old)
 
+    def so_far(steps: int) -> FilteredParticles:
+        if ahead is not None:
+            ahead.stop(steps)
+        return record.posterior(engine, "filter", steps)
+
     with Progress(problem.steps, engine.label, progress) as bar, quiet():
-        so_far = partial(record.posterior, engine, "filter")
-        pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
+        pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
         return record.posterior(engine, predictive=None if looks is None else looks.found())

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,6 +62,29 @@ class Tally(NamedTuple):
     old: list[np.ndarray]
     young: list[np.ndarray] | None
     families: Families
+
+
+class Sums(NamedTuple):
+    """Of slices in a row, in which particles agree on the same nodes.
+
+    Attributes
+    ----------
+    mean, variance : ndarray, shape (slices, numbers)
+    total : ndarray, shape (slices,)
+        Of the weights.
+    old, young : ndarray, shape (slices, 1 + numbers, groups)
+        As in a ``Tally``; those of the young origin are right where ``few``.
+    few, lost : ndarray of bool, shape (slices,)
+        Where few of the old origin's families are left; where the filter has lost sight.
+    """
+
+    mean: np.ndarray
+    variance: np.ndarray
+    total: np.ndarray
+    old: np.ndarray
+    young: np.ndarray
+    few: np.ndarray
+    lost: np.ndarray
 
 
 class Summing:
@@ -154,6 +177,17 @@ def answers(found: Sequence[Tally]) -> dict[str, Sequence[np.ndarray]]:
     return {n: tuple(map(np.concatenate, each)) for n, each in joined.items()}
 
 
+def figures(sums: Sums) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Means, variances and errors of all numbers, each ``(slices, numbers)``."""
+    total, few = sums.total[:, None, None], sums.few
+    errors = _variances(sums.old, total)
+    if few.any():
+        young, was = _variances(sums.young[few], total[few]), errors[few]
+        errors[few] = np.maximum(np.where(np.isinf(was), 0.0, was), young)
+    errors[sums.lost] = np.inf
+    return sums.mean, sums.variance, np.sqrt(errors)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -178,19 +212,18 @@ def _by_family(columns: Sequence[np.ndarray], bounds: np.ndarray) -> list[np.nda
 
 def _of_run(run: Sequence[Tally]) -> dict[str, Sequence[np.ndarray]]:
     """The same of slices in which particles agree on the same nodes."""
-    means = np.array([s.moments.mean for s in run])
-    variances = np.array([s.moments.variance for s in run])
-    total = np.array([s.total for s in run])[:, None, None]
-    errors = _variances([s.old for s in run], total)
-    few = [k for k, s in enumerate(run) if s.young is not None]
-    if few:
-        young, was = _variances([run[k].young for k in few], total[few]), errors[few]
-        errors[few] = np.maximum(np.where(np.isinf(was), 0.0, was), young)
-    for k, own in enumerate(run):
-        if own.families.lost is not None and own.families.lost.where:
-            errors[k] = np.inf
-    errors, places = np.sqrt(errors), run[0].moments.places
-    whole = means, variances, errors
+    old = np.array([s.old for s in run])
+    few = np.array([s.young is not None for s in run])
+    young = np.zeros_like(old)
+    for own, tally in zip(young, run, strict=True):
+        if tally.young is not None:
+            own[:] = tally.young
+    lost = [s.families.lost is not None and bool(s.families.lost.where) for s in run]
+    sums = Sums(
+        np.array([s.moments.mean for s in run]), np.array([s.moments.variance for s in run]),
+        np.array([s.total for s in run]), old, young, few, np.array(lost),
+    )  # fmt: skip
+    whole, places = figures(sums), run[0].moments.places
     found: dict[str, Sequence[np.ndarray]] = {
         n: tuple(a[:, low:high] for a in whole) for n, (low, high) in places.items()
     }
@@ -200,7 +233,7 @@ def _of_run(run: Sequence[Tally]) -> dict[str, Sequence[np.ndarray]]:
     return found
 
 
-def _variances(sums: Sequence[Any], total: np.ndarray) -> np.ndarray:
+def _variances(sums: np.ndarray, total: np.ndarray) -> np.ndarray:
     """Variances of means, shape (slices, numbers)."""
-    shares = np.array(sums) / total
+    shares = sums / total
     return by_shares(shares[:, 1:], shares[:, :1])

@@ -43,7 +43,7 @@ FADING, KEPT = 0.9, 0.995
 #: sum of moves, in units of their spread, from which on particles are missing
 IS = 4.5
 #: variance of moves below which nothing has moved
-_LEAST = 0.05
+LEAST = 0.05
 #: slices from one measurement of what is random to the next: a few, since lags and speeds pass noise on later
 STRETCH = 4
 #: variance of what is random since, over that of the particles when they were lost, that leads back
@@ -94,7 +94,7 @@ class Tracker:
             drifts = self.compass.after(drift, earlier, block)
         found = []
         for now, row, drift in zip(block.slices, rows, drifts, strict=True):
-            families = self._followed(families, earlier, now, row, drift)
+            families = self.followed_by(families, earlier, now, row, drift)
             found.append(families)
             earlier = now
         return found
@@ -106,19 +106,21 @@ class Tracker:
         compass, drift = self.compass, None if families is None else families.drift
         if compass is not None and compass.is_alone:
             drift = compass.after_one(drift, earlier, now)
-            return self._followed(families, earlier, now, row, drift)
+            return self.followed_by(families, earlier, now, row, drift)
         block = Block(self.layout, [now], room=self.room)
         return self.after(families, earlier, block, [row])[0]
 
     def summing(self, nodes: Sequence[CompiledNode]) -> Summing | None:
         """What takes the sums of slices with these nodes, where these say all; else None."""
-        every = {n.name: n for n in (*nodes, *self.sight.nodes)}.values()
-        if self.layout.particles < MANY or not self._is_plain:
-            return None
-        if any(n.domain is not None or n.angles is not None for n in every):
-            return None
+        every = list({n.name: n for n in (*nodes, *self.sight.nodes)}.values())
         few = sum(math.prod(n.value_shape) for n in every) <= NUMBERS
-        return Summing(list(every), self.layout.particles) if few else None
+        some = few and self.layout.particles >= MANY and self.is_summed(every)
+        return Summing(every, self.layout.particles) if some else None
+
+    def is_summed(self, nodes: Iterable[CompiledNode]) -> bool:
+        """Whether sums over particles say all of slices with these nodes."""
+        every = (*nodes, *self.sight.nodes)
+        return self._is_plain and all(n.domain is None and n.angles is None for n in every)
 
     def tally(
         self,
@@ -133,11 +135,9 @@ class Tracker:
         if self.compass is not None:
             drift = None if families is None else families.drift
             drift = self.compass.after_moments(drift, moments)
-        return summing.tally(now, moments, self._followed(families, earlier, now, row, drift))
+        return summing.tally(now, moments, self.followed_by(families, earlier, now, row, drift))
 
-    # ---- private -------------------------------------------------------------------------------
-
-    def _followed(
+    def followed_by(
         self,
         families: Families | None,
         earlier: Particles | None,
@@ -165,6 +165,8 @@ class Tracker:
         if missing is not False or lost is not None:
             lost = self.sight.after(lost, np.asarray(missing), now)
         return families._replace(settled=settled, lost=lost, scouts=scouts, drift=drift)
+
+    # ---- private -------------------------------------------------------------------------------
 
     def _quickly(
         self, families: Families, earlier: Particles, now: Particles, drift: Drift | None
@@ -320,7 +322,7 @@ class Compass:
             np.add.accumulate(steps, axis=1, out=steps)
             steps *= faded
         worst = np.abs(steps[0])
-        worst /= np.sqrt(steps[1] + _LEAST)
+        worst /= np.sqrt(steps[1] + LEAST)
         worst = worst[..., 0] if worst.shape[-1] == 1 else np.maximum.reduce(worst, axis=-1)
         if drift is not None:
             np.maximum(worst[0], KEPT * np.reshape(drift.worst, -1), out=worst[0])
@@ -347,7 +349,7 @@ class Compass:
                     moves[1, 0, own] += max(1.0 - found.variance[at] / wide, 0.0)
             k += count
         for moved, variance in moves[:, 0].T.tolist():
-            worst = max(worst, abs(moved) / math.sqrt(variance + _LEAST))
+            worst = max(worst, abs(moved) / math.sqrt(variance + LEAST))
         return Drift(moves, worst, worst, self.limit)
 
     def after_one(
@@ -372,7 +374,7 @@ class Compass:
                 left = float(now.weights.dot(squares)) / now.total - shift * shift
                 moved += shift / math.sqrt(wide)
                 variance += max(1.0 - left / wide, 0.0)
-        worst = max(worst, abs(moved) / math.sqrt(variance + _LEAST))
+        worst = max(worst, abs(moved) / math.sqrt(variance + LEAST))
         return Drift(np.array([moved, variance]).reshape(2, 1, 1), worst, worst, self.limit)
 
 

@@ -25,6 +25,7 @@ import scipy.special
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import ShapeError
+from bayesmc.kernels.accepted import Accepted
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.jump import Jump
@@ -261,7 +262,13 @@ def in_classes(kernel: Any, classes: Sequence[Any]) -> Any:
 
 
 def _read(space: StateSpace, kernel: Kernel) -> KernelMatrix:
-    """The matrix of one kernel."""
+    """The matrix of one kernel; of two, where the second hides what the first did, their product."""
+    if isinstance(kernel, Accepted) and kernel.other is not None:
+        both = [_read(space, one) for one in (kernel.alone(), kernel.other)]
+        matrix = both[0].matrix @ both[1].matrix
+        resolution = max(one.resolution for one in both)
+        parts = tuple(part for one in both for part in one.parts or (one,))
+        return KernelMatrix(tuple(kernel.names), kernel.label, owned(matrix), resolution, parts)
     stepper = Stepper(space, kernel)
     tree = Branches(stepper, len(space.codes))
     tree.check()
