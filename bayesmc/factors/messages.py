@@ -125,6 +125,7 @@ class ConditionalGaussian(Message):
         right = left.swapaxes(-1, -2)
         scaled = np.matvec(left, mean)
         precision, linear = right @ left, np.matvec(right, scaled)
+        precision = 0.5 * (precision + precision.swapaxes(-1, -2))  # differences show rounding
         size = np.log(np.abs(factor.diagonal(0, -2, -1))).sum(axis=-1)
         found = log - size - 0.5 * np.vecdot(scaled, scaled)
         return cls(found, *_without(none, linear, precision))

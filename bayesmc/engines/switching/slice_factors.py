@@ -63,6 +63,7 @@ class Scale(NamedTuple):
     def forward(self, log: np.ndarray, with_zeros: bool = False) -> ConditionalGaussian:
         """The forward pass's belief; without zeros, anything of modes that it rules out."""
         precision = np.matrix_transpose(self.root) @ self.root
+        precision = 0.5 * (precision + np.matrix_transpose(precision))
         linear = -np.matvec(np.matrix_transpose(self.root), self.mean)
         size = np.log(self.root.diagonal(0, -2, -1)).sum(axis=-1)
         found = np.where(log > -np.inf, log, 0.0) + size - 0.5 * np.vecdot(self.mean, self.mean)
