@@ -208,7 +208,10 @@ class Flat:
     scope = (0,)
 
     def tilted(self, cavities: Sequence[ConditionalGaussian], ends: Sequence[int]) -> Tilted:
-        wide = ConditionalGaussian(np.zeros(1), np.zeros((1, 1)), np.full((1, 1, 1), -2.0))
+        shape = cavities[0].log.shape
+        wide = ConditionalGaussian(
+            np.zeros(shape), np.zeros((*shape, 1)), np.full((*shape, 1, 1), -2.0)
+        )
         found = cavities[0].times(wide)
         return Tilted(found.log_total, [found])
 
@@ -224,6 +227,17 @@ def test_improper_messages_are_left_out_and_counted() -> None:
     assert not found.converged and found.open == 1 and found.change == 0.0
     assert np.isnan(found.log_total([Flat()]))
     np.testing.assert_allclose(found.beliefs[0].precision, 1.0)
+
+
+def test_problems_side_by_side_are_left_out_one_by_one() -> None:
+    both = np.array([[0.5, 1.0]])
+    prior = ConditionalGaussian.of(np.zeros((1, 2)), np.zeros((1, 2, 1)), both[..., None, None])
+    one = ConditionalGaussian.ones(1, (2,), 1)
+    found = propagate([prior], [Flat()], [[one]], [Visit(0, (0,))], sweeps=10)
+    assert found.converged.tolist() == [True, False] and found.open.tolist() == [0, 1]
+    np.testing.assert_allclose(found.beliefs[0].precision[0, :, 0, 0], [2.0, 1.0])
+    total = found.log_total([Flat()])
+    assert abs(total[0] - 0.5 * np.log(2.0)) < 1e-12 and np.isnan(total[1])  # sqrt(4 / 2)
 
 
 class Swinging:

@@ -25,7 +25,7 @@ from bayesmc.progress import Progress
 
 
 class SwitchingBelief(SliceBelief):
-    """A mixture over the modes of one slice, as ``start`` and ``step`` of engines of switching systems give it.
+    """A mixture over the modes of one slice, as ``start`` and ``step`` of its engines give it.
 
     Attributes
     ----------
