@@ -110,6 +110,11 @@ COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
         1e-6,
         ("switching",),
     ),
+    "ExpectationPropagation": (
+        bmc.ExpectationPropagation(tolerance=1e-10),
+        1e-7,
+        ("linear", "switching"),
+    ),
     "no engine named": (None, 1e-7, ("finite", "linear")),
 }
 

@@ -36,7 +36,8 @@ _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "BoyenKoller": "all hidden nodes are finite, but too many for one joint state",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
-    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate",
+    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate "
+    "(smoothed, those of ExpectationPropagation mostly less)",
     "ParticleFilter": "every hidden node can be sampled given its parents",
     "GridFilter": "hidden nodes are finite, angles, on bounded intervals, or the one number of a slice",
 }

@@ -103,25 +103,46 @@ class SwitchingRun:
 
     def smoothed(self, filtered: list[Mixture], lag: int | None) -> list[Mixture]:
         """The same given all rows, or those of so many slices later: Kim's smoother."""
-        carried, steps, places = self.data.layouts[0].carried, self.data.steps, self.places
-        filtered = [whole(place, found) for place, found in zip(places, filtered, strict=True)]
-        backs: list[Back | None] = [None] * steps
-        for k in range(1, steps):
-            backs[k] = turned_back(filtered[k - 1], places[k])
+        carried, steps = self.data.layouts[0].carried, self.data.steps
+        filtered = self.completed(filtered)
+        backs = self.turned(filtered)
         found: list[Mixture] = [filtered[-1]] * steps
-        ends = [steps - 1] if lag is None else range(steps)
-        for end in ends:
+        if lag is None:
+            for k, here in enumerate(self.noise(filtered, backs)[:-1]):
+                found[k] = applied(filtered[k], here)
+            return found
+        for end in range(steps):
             here = unsmoothed(filtered[end], carried)
-            stop = 0 if lag is None else max(0, end - lag)
-            if lag is None or end == steps - 1 or not lag:
+            stop = max(0, end - lag)
+            if end == steps - 1 or not lag:
                 found[end] = filtered[end]
             for k in range(end, stop, -1):
                 back = backs[k]
                 assert back is not None
-                here = smoothed(back, places[k], filtered[k], here)
-                if lag is None or end == steps - 1 or k - 1 == end - lag:
-                    found[k - 1] = _applied(filtered[k - 1], here)
+                here = smoothed(back, self.places[k], filtered[k], here)
+                if end == steps - 1 or k - 1 == end - lag:
+                    found[k - 1] = applied(filtered[k - 1], here)
         return found
+
+    def completed(self, filtered: list[Mixture]) -> list[Mixture]:
+        """With all unknown numbers."""
+        return [whole(place, found) for place, found in zip(self.places, filtered, strict=True)]
+
+    def turned(self, filtered: list[Mixture]) -> list[Back | None]:
+        """How every slice but the first leads back to the one before."""
+        steps = range(1, self.data.steps)
+        return [None, *(turned_back(filtered[k - 1], self.places[k]) for k in steps)]
+
+    def noise(self, filtered: list[Mixture], backs: list[Back | None]) -> list[Smoothed]:
+        """Moments of the filter's noise given all rows, slice by slice."""
+        here = unsmoothed(filtered[-1], self.data.layouts[0].carried)
+        found = [here]
+        for k in range(self.data.steps - 1, 0, -1):
+            back = backs[k]
+            assert back is not None
+            here = smoothed(back, self.places[k], filtered[k], here)
+            found.append(here)
+        return found[::-1]
 
     @cached_property
     def places(self) -> list[Place]:
@@ -355,6 +376,15 @@ def values_by_mode(model: Any, told: Mapping[str, tuple[Any, Any]]) -> dict[str,
     }
 
 
+def applied(filtered: Mixture, later: Smoothed) -> Mixture:
+    """Numbers whose noise has other moments than the filter's."""
+    c = later.noise.shape[-1]
+    left = filtered.factor[..., :c]
+    mean = filtered.mean + np.matvec(left, later.noise)
+    factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
+    return Mixture(later.log, mean, factor)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -364,15 +394,6 @@ def _check_count(count: int, options: Options) -> None:
             f"the finite nodes of a slice have {count} joint states that are possible, more than max_modes="
             f"{options.most}; allow more, or use ParticleFilter"
         )
-
-
-def _applied(filtered: Mixture, later: Smoothed) -> Mixture:
-    """Numbers whose noise has other moments than the filter's."""
-    c = later.noise.shape[-1]
-    left = filtered.factor[..., :c]
-    mean = filtered.mean + np.matvec(left, later.noise)
-    factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
-    return Mixture(later.log, mean, factor)
 
 
 def _is_carried(layout: Layout, pattern: Pattern) -> bool:
