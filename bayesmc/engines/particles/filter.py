@@ -204,7 +204,7 @@ class ParticleFilter(FilterEngine):
         check_numbers(self)
         scheme_of(self.resampling)
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
-        if self.compiled not in (None, True, False):
+        if self.compiled is not None and not isinstance(self.compiled, bool):
             raise ValueError(
                 f"ParticleFilter(compiled={self.compiled!r}): give True, False or None"
             )
