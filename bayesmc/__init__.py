@@ -62,6 +62,7 @@ from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
+from bayesmc.engines.switching.propagation import ExpectationPropagation
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
@@ -92,6 +93,7 @@ __all__ = [
     "DynamicBayesNet",
     "Distribution",
     "Exact",
+    "ExpectationPropagation",
     "Explanation",
     "Exponential",
     "ExtendedKalmanFilter",

@@ -221,7 +221,7 @@ class LowEssWarning(BayesmcWarning):
 
 
 class ConvergenceWarning(BayesmcWarning):
-    """Chains that have not mixed, or a block that accepts too few or too many of its proposals."""
+    """Chains that have not mixed, a block that accepts too few or too many proposals, unsettled messages."""
 
 
 class InterruptWarning(BayesmcWarning):

@@ -8,6 +8,7 @@ from benchmarks import (
     bench_exact,
     bench_gaussian,
     bench_gibbs,
+    bench_marginal,
     bench_robot_logs,
     bench_robots,
     bench_scale,
@@ -34,6 +35,8 @@ if __name__ == "__main__":
     bench_time.main(sys.argv[1:])
     print()
     bench_switching.main()
+    print()
+    bench_marginal.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()

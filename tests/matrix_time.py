@@ -31,8 +31,8 @@ from tests.matrix import DOUBTS, SHIFT
 
 #: "static": a static node is unknown, which particle chains alone answer; "one number": linear ones of which
 #: the default grid finds its range and cells; "switching": linear ones with modes that make no difference to
-#: numbers, so that filters that merge Gaussians are exact
-KINDS = ("finite", "linear", "static", "one number", "switching")
+#: numbers, so that filters that merge Gaussians are exact "modes": with ones that do
+KINDS = ("finite", "linear", "static", "one number", "switching", "modes")
 #: templates of each kind for engines that compute, and for those with particles, which take longer
 MANY, FEW = session.scaled(5, 8), session.scaled(2, 15)
 GRID = bmc.GridFilter()
@@ -59,6 +59,8 @@ def series(kind: str, seed: int) -> Series | None:
         case: Any = random_dbn(seed, nodes=(1, 3), steps=(2, 4))
     elif kind == "switching":
         case = random_switching_dbn(seed, difference=0.0)
+    elif kind == "modes":
+        case = random_switching_dbn(seed)
     else:
         case = random_linear_dbn(seed, vague=2.0)
     data = dict(case.observations)
@@ -108,6 +110,11 @@ COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
         1e-6,
         ("switching",),
     ),
+    "ExpectationPropagation": (
+        bmc.ExpectationPropagation(tolerance=1e-10),
+        1e-7,
+        ("linear", "switching"),
+    ),
     "no engine named": (None, 1e-7, ("finite", "linear")),
 }
 
@@ -117,6 +124,14 @@ PARTICLES: dict[str, dict[str, Any]] = {
     "auxiliary": {"auxiliary": True},
     "optimal": {"proposal": "optimal"},
 }
+#: those that integrate numbers out given finite nodes
+MARGINAL: dict[str, dict[str, Any]] = {
+    "integrated": {"marginalize": "auto"},
+    "mixture Kalman": {"marginalize": "auto", "proposal": "optimal"},
+}
+#: which is tried on which kind of template
+TRIED = [(v, k) for v in PARTICLES for k in ("finite", "linear")]
+TRIED += [(v, "modes") for v in MARGINAL]
 
 #: engines of chains, and the kinds of templates that they answer, a third of them or more without a doubt of
 #: their own

@@ -25,6 +25,7 @@ ONLINE: dict[str, tuple[Any, tuple[str, ...]]] = {
     "ExtendedKalmanFilter": (bmc.ExtendedKalmanFilter(), ("linear",)),
     "UnscentedKalmanFilter": (bmc.UnscentedKalmanFilter(), ("linear",)),
     "SwitchingKalmanFilter": (bmc.SwitchingKalmanFilter(), ("linear", "switching")),
+    "ExpectationPropagation": (bmc.ExpectationPropagation(), ("switching",)),
     "bootstrap": (bmc.ParticleFilter(100), ("finite", "linear")),
     "auxiliary": (bmc.ParticleFilter(100, auxiliary=True), ("finite", "linear")),
     "optimal": (bmc.ParticleFilter(100, proposal="optimal"), ("finite", "linear")),

@@ -17,6 +17,7 @@ from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.marginal.options import split_of_problem
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
@@ -36,7 +37,8 @@ _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "BoyenKoller": "all hidden nodes are finite, but too many for one joint state",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
-    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate",
+    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate "
+    "(smoothed, those of ExpectationPropagation mostly less)",
     "ParticleFilter": "every hidden node can be sampled given its parents",
     "GridFilter": "hidden nodes are finite, angles, on bounded intervals, or the one number of a slice",
 }
@@ -289,7 +291,7 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
     displaced: FilterEngine | None = None
     plain = Asked(asked.what)
     for candidate in _CANDIDATES:
-        engine, name = candidate(), candidate.__name__
+        engine, name = _made(candidate, problem, asked), candidate.__name__
         if isinstance(engine, BoyenKoller) and not DiscreteFilter().is_out_of_room(problem):
             continue  # it has nothing to say that an exact filter does not
         reason = engine.refusal(problem)
@@ -317,6 +319,15 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
         raise UnsupportedError(f"{asked.what}: {alike}")
     whys = ". ".join(w if w.startswith(n) else f"{n}: {w}" for n, w in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
+
+
+def _made(candidate: type[FilterEngine], problem: SeriesProblem, asked: Asked) -> FilterEngine:
+    """A candidate; particles integrate out what they can, where they answer what is asked then."""
+    if candidate is ParticleFilter and common_refusal(ParticleFilter(), problem) is None:
+        engine = ParticleFilter(marginalize="auto")
+        if split_of_problem(engine, problem) and _why_not(engine, problem, asked) is None:
+            return engine
+    return candidate()
 
 
 def _instead(

@@ -61,12 +61,10 @@ def read_queries(call: str, queries: Any) -> Queries:
         )
     for name, function in queries.items():
         if not isinstance(name, str) or not callable(function):
-            raise QueryError(
-                f"{call}(queries={{{name!r}: {function!r}}}): {name!r} is no name of a function; {fix}"
-                if not isinstance(name, str)
-                else f"{call}(queries={{{name!r}: {function!r}}}): a {type(function).__name__} is no "
-                f"function; {fix}"
-            )
+            what = f"{name!r} is no name of a function"
+            if isinstance(name, str):
+                what = f"a {type(function).__name__} is no function"
+            raise QueryError(f"{call}(queries={{{name!r}: {function!r}}}): {what}; {fix}")
     return queries
 
 
@@ -312,12 +310,14 @@ def common_refusal(engine: FilterEngine | str, problem: SeriesProblem) -> str | 
     if not problem.unknown_static:
         return None
     names = ", ".join(map(repr, problem.unknown_static))
-    if isinstance(engine, str):
-        takes = f"{engine} infers static nodes, and"
-    else:
-        takes = f"{type(engine).__name__} takes static nodes as known, and"
+    own = isinstance(engine, FilterEngine)
+    takes = (
+        f"{type(engine).__name__} takes static nodes as known"
+        if own
+        else f"{engine} infers static nodes"
+    )
     return (
-        f"{takes} {names} is not observed; observe it (its value in observations=), or infer it with the "
+        f"{takes}, and {names} is not observed; observe it (its value in observations=), or infer it with the "
         "trajectory: infer(dbn, observations), by itself or with engine=ParticleGibbs(draws), "
         "ParticleMetropolis(draws) or another static engine"
     )
@@ -384,8 +384,7 @@ def in_slice(t: int) -> Iterator[None]:
     try:
         yield
     except BayesmcError as error:
-        told = str(error)
-        if not re.search(rf"\bslice {t}\b", told) and not re.match(r"slice \d+: ", told):
+        if not re.search(rf"\bslice {t}\b|^slice \d+: ", told := str(error)):
             error.args = (f"slice {t}: {told}", *error.args[1:])
         raise
     except Exception as error:  # somebody else's: its arguments may mean anything

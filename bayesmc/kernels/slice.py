@@ -275,6 +275,8 @@ class Slice(Kernel):
     def _asked(self, values: Values, chain: int, value: np.ndarray) -> np.ndarray:
         """Log densities of one chain by the model's functions, where its elements stand at a value."""
         state = self._row(values, np.unravel_index(chain, self.sites.lead(values)))
+        # elements of earlier turns have moved, and those of later ones read them
+        state[self.blanket.name] = value.astype(values[self.blanket.name].dtype)[None]
         shape = self.blanket.node.plate_shape
         found = np.zeros(shape).reshape(-1)
         for members in self.blanket.classes:

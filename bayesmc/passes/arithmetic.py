@@ -178,7 +178,8 @@ class TermReader:
             rule = self.rules.get(node.function)
             if rule is not None:
                 return rule(self, node)
-            if node.function in CASTS:
+            kept = CASTS.get(node.function)
+            if kept is not None and np.can_cast(node.operands[0].dtype, kept):  # no number is cut
                 return self(node.operands[0])
         return self.term(node)
 

@@ -190,7 +190,8 @@ class _Reader(TermReader):
         first, second = node.operands
         if self.is_free(second):
             return {f: divide(c, second) for f, c in self(first).items()}
-        below = self.each(self(second), lambda c: divide(1.0, c), lambda p, c: (-p, divide(1.0, c)))
+        powers = _powers(self(second))
+        below = self.each(powers, lambda c: divide(1.0, c), lambda p, c: (-p, divide(1.0, c)))
         return _product(_powers(self(first)), below)
 
     def square(self, node: Elementwise) -> Features:

@@ -13,12 +13,12 @@ from collections.abc import Callable
 import numpy as np
 
 from bayesmc.errors import UnsupportedError
-from bayesmc.expression import Elementwise, Expression, Program, ordered
+from bayesmc.expression import Elementwise, Expression, Program, elementwise, ordered
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.unconstrained_check import other_values
 
 #: what is another from one number to the next, besides comparisons and whole numbers
-_STEPS = (np.floor, np.ceil, np.trunc, np.rint, np.sign, np.floor_divide, np.remainder)
+_STEPS = (np.floor, np.ceil, np.trunc, np.rint, np.sign, np.floor_divide, np.remainder, np.fmod)
 #: ways that each node is moved, how far free numbers are from zero, and bisections of a way
 _WAYS, _SPREAD, _HALVES = 8, 2.0, 48
 #: difference of the log density that is left at a jump, and numbers that are looked at, at most
@@ -55,7 +55,7 @@ def jumps(density: UnconstrainedDensity) -> frozenset[str]:
     >>> sorted(jumps(unconstrained_density(target_of(pose(net, {"y": [0.0, 0.0, 2.0]})))))
     ['change']
     """
-    steps = [node for node in ordered(density.root) if _is_step(node)]
+    steps = [_whole(node) for node in ordered(density.root) if _is_step(node)]
     if not steps:
         return frozenset()
     program = Program([density.root, *steps])
@@ -96,6 +96,13 @@ def _is_step(node: Expression) -> bool:
     if FREE not in node.leaves:
         return False
     return node.dtype.kind in "biu" or (isinstance(node, Elementwise) and node.function in _STEPS)
+
+
+def _whole(node: Expression) -> Expression:
+    """What of a step is the same on either side: of a remainder the whole part, which it leaves out."""
+    if isinstance(node, Elementwise) and node.function in (np.remainder, np.fmod):
+        return elementwise(np.floor_divide, *node.operands)
+    return node
 
 
 def _bisected(

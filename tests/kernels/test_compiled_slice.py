@@ -7,6 +7,7 @@ Statistical tests are Geweke's and the rank test at a chance of false alarm of 1
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -278,6 +279,22 @@ def test_functions_are_asked_for_one_chain(model: Any) -> None:
         for chain in (0, 17, 49):
             found = kernel._asked(values, chain, value[chain])
             np.testing.assert_allclose(found, wanted[chain], rtol=1e-9)
+
+
+def test_functions_are_asked_where_earlier_elements_have_moved() -> None:
+    """A square root of a negative number is asked of the model; every move is compared with NumPy's."""
+    first, after = np.arange(6), (np.arange(6) + 1) % 6
+    net = bmc.BayesNet(plates={"i": 6, "k": 6})
+    net.add("x", bmc.Normal(0.0, 1.5), plates="k")
+    net.add(
+        "y",
+        lambda x: bmc.Normal(x[after] * np.where(x[first] > 0, 1.0, -0.5), np.sqrt(x[first] + 2.0)),
+        plates="i",
+    )
+    engine = bmc.Gibbs(20, warmup=20, chains=4, compiled=True, debug=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        bmc.infer(net, {"y": [0.0, 1.0, 0.0, 0.5, -0.5, 1.5]}, engine=engine, rng=1)
 
 
 def walk() -> tuple[Stacked, Any, dict[str, np.ndarray]]:

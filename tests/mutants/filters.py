@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc.testing.oracles.answers import exact
 from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.faults import Edit
@@ -65,6 +66,46 @@ def machine() -> bmc.DynamicBayesNet:
     return dbn
 
 
+def driven() -> bmc.DynamicBayesNet:
+    """A level that is pushed and shaken by a regime, which starts otherwise than it goes on."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("z", ["z_prev"], [[0.7, 0.3], [0.4, 0.6]], initial=[0.2, 0.8])
+    dbn.add(
+        "x",
+        lambda x_prev, z: bmc.Normal(0.9 * x_prev + 1.5 * z, np.where(z == 1, 1.5, 0.3)),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    return dbn
+
+
+def driven_by_the_last() -> bmc.DynamicBayesNet:
+    """The same by the regime of the slice before."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("z", ["z_prev"], [[0.7, 0.3], [0.4, 0.6]], initial=[0.2, 0.8])
+    dbn.add(
+        "x",
+        lambda x_prev, z_prev: bmc.Normal(0.9 * x_prev + 3.0 * z_prev, 0.5),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    return dbn
+
+
+def shaken() -> bmc.DynamicBayesNet:
+    """A level that is shaken, more or less, by a regime that has a sensor of its own."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("z", ["z_prev"], [[0.9, 0.1], [0.1, 0.9]], initial=[0.5, 0.5])
+    dbn.add(
+        "x",
+        lambda x_prev, z: bmc.Normal(x_prev, np.where(z == 1, 3.0, 0.2)),
+        initial=bmc.Normal(0.0, 3.0),
+    )
+    dbn.table("w", ["z"], [[0.9, 0.1], [0.1, 0.9]])
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    return dbn
+
+
 def unknown_drift() -> bmc.DynamicBayesNet:
     """A walk with a drift that is not known."""
     dbn = bmc.DynamicBayesNet()
@@ -111,6 +152,20 @@ def squares(seed: int) -> Verdict:
     return repeated_test(asked, right, replications=2, alpha=ALPHA, rng=seed)
 
 
+def variance_of_driven(seed: int) -> Verdict:
+    """Filtered second moments of what is integrated out, times the ratio of evidences."""
+    right = exact(driven(), MILD)
+
+    def estimate(rng: np.random.Generator) -> float:
+        engine = bmc.ParticleFilter(300, marginalize="auto")
+        found = bmc.filter(driven(), MILD, engine=engine, rng=rng)
+        ratio = np.exp(found.log_marginal_likelihood - right.log_marginal_likelihood)
+        return float(ratio * (found.var("x")[-1] + found.mean("x")[-1] ** 2))
+
+    wanted = right.var("x")[-1] + right.mean("x")[-1] ** 2
+    return repeated_test(estimate, wanted, replications=40, alpha=ALPHA, rng=seed)
+
+
 ROWS = {"y": [0.5, 1.5, 3.0, 2.0]}
 RISING = {"y": [0.0, 2.0, 4.0]}
 PARTICLES = "unbiased_evidence_test, 100 runs of 30 particles"
@@ -119,7 +174,9 @@ STATED = "stated_errors_test, 150 runs of 300 particles"
 LONG = {
     "y": [0.3, 0.8, 1.2, 0.7, -0.4, -1.3, -0.5, 0.2, 0.9, 1.6, 1.1, 0.1, -0.7, 0.0, 0.6, 1.4] * 4
 }
+BLIND = {"y": [np.nan] * 5 + [0.5], "w": [0, 0, 1, 0, 0, 0]}
 ALWAYS = bmc.ParticleFilter(30, ess_threshold=2.0)
+OPTIMAL = bmc.ParticleFilter(30, marginalize="auto", proposal="optimal")
 
 
 def after_pickle(engine: Any, rows: list[float] | None, runs: int) -> Test:
@@ -152,7 +209,7 @@ def after_pickle(engine: Any, rows: list[float] | None, runs: int) -> Test:
 MUTANTS = [
     Mutant(
         "a belief out of a pickle forgets the evidence so far",
-        (Edit("bayesmc.engines.particles.filter:ParticleFilter._bound",
+        (Edit("bayesmc.engines.particles.belief:bound",
               "belief.log_marginal_likelihood,", "0.0,"),),
         after_pickle(bmc.ParticleFilter(200), MILD["y"], 100),
         "repeated_test, 100 runs of 200 particles",
@@ -267,6 +324,44 @@ MUTANTS = [
               "< log - bound", "< 0.0 * log"),),
         slices(bmc.smooth, line, RISING, bmc.ParticleFilter(300), 20),
         "repeated_test of smooth, 20 runs of 300 particles",
+    ),
+    Mutant(
+        "a start is sampled, and kept in the covariance as well",
+        (Edit("bayesmc.engines.marginal.step:MarginalStep._taken",
+              "made.chosen(None)",
+              "(lambda g: g._replace(mean=g.drawn(rng)) if row.t == 0 else g)(made.chosen(None))"),),
+        evidence_of(shaken, BLIND, bmc.ParticleFilter(100, marginalize="auto"), 200),
+        "unbiased_evidence_test, 200 runs of 100 particles",
+    ),
+    Mutant(
+        "finite nodes drawn given the row are not weighed by p/q",
+        (Edit("bayesmc.engines.marginal.step:MarginalStep._taken",
+              "log + own, made.chosen(at)", "log + made.log.mean(axis=1), made.chosen(at)"),),
+        evidence_of(driven, MILD, OPTIMAL, 150),
+        "unbiased_evidence_test, 150 runs of 30 particles",
+    ),
+    Mutant(
+        "a Kalman filter for each particle takes this slice's regime for the last one's",
+        (Edit("bayesmc.engines.marginal.step:MarginalStep._values",
+              "self.taken(k, v, selection.ancestors)",
+              "values.get(k.removesuffix('_prev'), self.taken(k, v, selection.ancestors))"),),
+        evidence_of(driven_by_the_last, MILD, bmc.ParticleFilter(30, marginalize="auto"), 150),
+        "unbiased_evidence_test, 150 runs of 30 particles",
+    ),
+    Mutant(
+        "covariances are not resampled",
+        (Edit("bayesmc.engines.marginal.gaussians:Gaussians.taken",
+              "which = self.which.take(ancestors)", "which = self.which[: len(ancestors)]"),),
+        evidence_of(shaken, BLIND,
+                    bmc.ParticleFilter(100, marginalize="auto", ess_threshold=2.0), 200),
+        "unbiased_evidence_test, 200 runs of 100 particles",
+    ),
+    Mutant(
+        "the variance of what is integrated out is that of the particles' means",
+        (Edit("bayesmc.engines.particles.blocks:Block._moments",
+              "variance += self.weighted(self.turned(inside, self._axes(node)))", "pass"),),
+        variance_of_driven,
+        "repeated_test of variances, 40 runs of 300 particles",
     ),
     Mutant(
         "a Kalman filter predicts without process noise",

@@ -1,4 +1,4 @@
-"""Faults of switching Kalman filters, where they must be exact.
+"""Faults of switching Kalman filters and of expectation propagation, where they must be exact.
 
 GPB2 is exact for two slices, IMM tells the moments of a slice without a row after one that has one, GPB1 its
 means; where modes make no difference to numbers all of them are exact throughout.
@@ -6,11 +6,16 @@ means; where modes make no difference to numbers all of them are exact throughou
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc.errors import ConvergenceWarning
+from bayesmc.factors.expectation_propagation import Tilted, Visit, propagate
+from bayesmc.factors.messages import ConditionalGaussian
 from bayesmc.testing.oracles.answers import exact
 from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.verdict import Verdict
@@ -65,11 +70,52 @@ def smoothed(seed: int) -> Verdict:
     return repeated_test(estimate, right, replications=2, alpha=ALPHA, rng=seed)
 
 
+def propagated(seed: int) -> Verdict:
+    """The same by messages, and the evidence."""
+    dbn = switching(0.0)
+
+    def estimate(rng: np.random.Generator) -> dict[str, np.ndarray]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # figures are what is judged
+            found = bmc.smooth(dbn, LONG, engine=bmc.ExpectationPropagation(damping=0.0))
+        return figures(found) | {"log": np.nan_to_num(found.log_marginal_likelihood)}
+
+    answer = exact(switching(0.0), LONG)
+    right = figures(answer) | {"log": np.array(answer.log_marginal_likelihood)}
+    return repeated_test(estimate, right, replications=2, alpha=ALPHA, rng=seed)
+
+
+class _Slim:
+    """A Gaussian factor of one number, of precision 4 at 1."""
+
+    scope = (0,)
+
+    def tilted(self, cavities: Sequence[Any], ends: Sequence[int]) -> Tilted:
+        found = cavities[0].times(
+            ConditionalGaussian.of(np.zeros(1), np.ones((1, 1)), np.full((1, 1, 1), 0.5))
+        )
+        return Tilted(found.log_total, [found])
+
+
+def damped(seed: int) -> Verdict:
+    """One sweep from a flat message: a share of 1 - damping of the factor's own."""
+    prior = ConditionalGaussian.of(np.zeros(1), np.zeros((1, 1)), np.ones((1, 1, 1)))
+    one = ConditionalGaussian.ones(1, (), 1)
+
+    def estimate(rng: np.random.Generator) -> dict[str, np.ndarray]:
+        found = propagate([prior], [_Slim()], [[one]], [Visit(0, (0,))], sweeps=1, damping=0.25)
+        return {"precision": found.beliefs[0].precision, "linear": found.beliefs[0].linear}
+
+    right = {"precision": np.full((1, 1, 1), 1.0 + 0.75 * 4.0), "linear": np.full((1, 1), 3.0)}
+    return repeated_test(estimate, right, replications=2, alpha=ALPHA, rng=seed)
+
+
 LONG = {"y": np.array([0.5, 1.2, np.nan, 2.5]), "o": np.array([0.0, 1.0, 1.0, 0.0])}
 TWO = {"y": np.array([0.5, 1.9]), "o": np.array([0.0, 1.0])}
 AHEAD = {"y": np.array([1.5, np.nan]), "o": np.array([0.0, np.nan])}
 FILTER, SMOOTH = "repeated_test of filter (no draws)", "repeated_test of smooth (no draws)"
 AT = "bayesmc.engines.switching."
+LOOP = "bayesmc.factors.expectation_propagation"
 
 MUTANTS = [
     Mutant(
@@ -108,6 +154,25 @@ MUTANTS = [
         "Kim's smoother takes the next slice's numbers for known",
         (Edit(f"{AT}passes:smoothed", "root = left @ later.spread", "root = 0.0 * left @ later.spread"),),
         smoothed,
+        SMOOTH,
+    ),
+    Mutant(
+        "what came from outside is not divided out of a message",
+        (Edit(f"{LOOP}:_State.visited", "belief.over(cavities[end], own[end])", "belief"),),
+        propagated,
+        SMOOTH,
+    ),
+    Mutant(
+        "damping is applied twice",
+        (Edit(f"{LOOP}:_State.visited", "self.share)", "self.share**2)"),),
+        damped,
+        "repeated_test of one sweep (no draws)",
+    ),
+    Mutant(
+        "messages meet the modes of a slice transposed",
+        (Edit(f"{AT}slice_factors:SliceFactor._noise", "(self.pairs.src, self.pairs.dst)",
+              "(self.pairs.dst, self.pairs.src)"),),
+        propagated,
         SMOOTH,
     ),
 ]  # fmt: skip

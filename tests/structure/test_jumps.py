@@ -50,6 +50,7 @@ def of(function: Any) -> frozenset[str]:
         (lambda a, b: np.where(a < b, 1.0, 2.0), {"a", "b"}),
         (lambda a, b: np.sign(a) + b, {"a"}),
         (lambda a, b: (a > 0.0) * b, {"a"}),
+        (lambda a, b: a % 1.0 + b, {"a"}),
         (lambda a, b: np.where(YEAR < 3.0 * a, YEAR - 3.0 * a, 0.0) * b, set()),  # a hinge
         (lambda a, b: np.maximum(a, b) + np.abs(a) + np.where(b > 0.0, b, 0.1 * b), set()),
         (lambda a, b: np.clip(a, -1.0, 1.0) + b, set()),

@@ -54,16 +54,24 @@ def why_not_gaussian(layout: Layout, values: Mapping[str, np.ndarray]) -> str | 
             return f"node {name!r} is hidden and discrete"
     for name in layout.silent:
         return f"node {name!r} is computed from hidden nodes and takes no continuous values"
-    for name in layout.placed:
-        node = layout.model[name]
-        try:
-            if node.is_stochastic and (node.is_discrete or node.domain is not None):
-                return f"node {name!r} is discrete and depends on continuous nodes that are hidden"
-            if node.is_stochastic and len(node.event_shape) > 1:
-                return f"node {name!r} is a matrix of shape {node.event_shape}"
-            _linear(layout, name, values)
-        except NotLinearError as error:
-            return f"node {name!r} {error}"
+    reasons = (why_not_placed(layout, name, values) for name in layout.placed)
+    return next(
+        (f"node {name!r} {why}" for name, why in zip(layout.placed, reasons, strict=True) if why),
+        None,
+    )
+
+
+def why_not_placed(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> str | None:
+    """Why a node with a place is not linear-Gaussian in what is unknown, to follow its name; or None."""
+    node = layout.model[name]
+    if node.is_stochastic and (node.is_discrete or node.domain is not None):
+        return "is discrete and depends on continuous nodes that are hidden"
+    if node.is_stochastic and len(node.event_shape) > 1:
+        return f"is a matrix of shape {node.event_shape}"
+    try:
+        _linear(layout, name, values)
+    except NotLinearError as error:
+        return str(error)
     return None
 
 

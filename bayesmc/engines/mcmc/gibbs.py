@@ -124,7 +124,7 @@ class Gibbs(ChainEngine):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count(self, "threads", self.threads, "2")
-        if self.compiled not in (None, True, False):
+        if self.compiled is not None and not isinstance(self.compiled, bool):
             raise ValueError(f"Gibbs(compiled={self.compiled!r}): compiled is True, False or None")
 
     def refusal(self, problem: Problem) -> str | None:

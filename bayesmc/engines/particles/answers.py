@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.engines.averages import as_event, called
+from bayesmc.engines.marginal.mixtures import covariance_within, mixture_quantiles
 from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
@@ -116,6 +117,13 @@ class Answers(NamedTuple):
         value = value if node.domain is None else numbers_of(node)[value]
         return np.broadcast_to(value, (len(particles.weights), *node.value_shape))
 
+    def _means(self, particles: Particles, node: CompiledNode) -> np.ndarray:
+        """The same; of what is integrated out each particle's own mean."""
+        inner = particles.inner
+        if inner is not None and inner.has(node.name):
+            return np.asarray(inner.mean_of(node))
+        return self._numbers(particles, node)
+
     def _quantiles(self, now: Particles, node: CompiledNode, levels: Any) -> np.ndarray:
         layout, numbers = self.layout, self._numbers(now, node)
         if node.angles is not None:  # an order needs a cut: opposite the mean
@@ -128,14 +136,19 @@ class Answers(NamedTuple):
             shape[1 + axis] = size
         weights = now.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
         weights = np.broadcast_to(weights, numbers.shape)
+        if now.inner is not None and now.inner.has(node.name):
+            return mixture_quantiles(now.inner, node, weights, levels)
         return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
 
     def _covariance(self, now: Particles, names: tuple[str, ...]) -> np.ndarray:
         n = len(now.weights)
-        columns = [self._numbers(now, self.model[name]).reshape(n, -1) for name in names]
+        columns = [self._means(now, self.model[name]).reshape(n, -1) for name in names]
         flat, shares = np.concatenate(columns, axis=1).astype(float), now.weights / now.total
         flat = flat - shares @ flat
         matrix = (flat * shares[:, None]).T @ flat
+        if now.inner is not None:
+            nodes = [self.model[name] for name in names]
+            matrix += covariance_within(now.inner, nodes, shares)
         return matrix[0, 0] if matrix.size == 1 else matrix
 
 

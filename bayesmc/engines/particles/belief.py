@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Slices
+from bayesmc.dbn import DynamicBayesNet, Row, Slices, read_static
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.particles.answers import Answers, numbers_of
 from bayesmc.engines.particles.blocks import Block
@@ -15,10 +15,11 @@ from bayesmc.engines.particles.errors import ByFamily, node_errors
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
-from bayesmc.engines.particles.smc import Bare, Particles
+from bayesmc.engines.particles.smc import Bare, Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode
+from bayesmc.randomness import Purpose, resumed, stream
 from bayesmc.results.posterior import table_variance
 
 
@@ -221,3 +222,42 @@ class ParticleBelief(OnlineBelief):
                 f"particles of {name!r} are not kept; there are those of {list(now.values)}"
             )
         return self._step.slices.first[name]
+
+
+def bound(
+    engine: Any, belief: ParticleBelief, dbn: DynamicBayesNet, slices: Slices
+) -> ParticleBelief:
+    """A belief out of a pickle with the functions of a template that fits it."""
+    held, most = len(belief.weights), engine.particles
+    if held > most or (held < most and engine.adapt is None):
+        raise ValueError(
+            f"ParticleFilter({most}).start: the belief has {held} particles; go on with the "
+            "engine that it was started with"
+        )
+    inner = None if belief.now is None else belief.now.inner
+    seen = () if inner is None else inner.seen
+    step = engine.step_of(slices, read_static(slices, belief.static), seen=seen)
+    return ParticleBelief(
+        dbn, belief.seed, belief.static, step, belief.now,
+        belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
+    )  # fmt: skip
+
+
+def absorbed(engine: Any, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
+    """The belief after one more row, by an engine that has a number of particles."""
+    step, tracker = belief.made_by, belief.tracker
+    if not isinstance(step, FilterStep):
+        full = [n for n, o in row.seen.items() if o.mask is None]
+        step = engine.step_of(slices, read_static(slices, belief.static), seen=full)
+    tracker = Tracker(step) if tracker is None else tracker
+    chance = belief.chance
+    rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
+    with quiet():
+        now = step(belief.now, row, rng)
+        families = tracker.after_one(belief.families, belief.now, now, row)
+    total = belief.log_marginal_likelihood + now.increment
+    return ParticleBelief(
+        belief.dbn, belief.seed, belief.static, step, now,
+        total if np.ndim(total) else float(total), rng.bit_generator.state,
+        {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
+    )  # fmt: skip

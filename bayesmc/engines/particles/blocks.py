@@ -82,7 +82,7 @@ class Block:
         """A node's stored values; None where all particles agree."""
         key = ("rows", node.name)
         if key not in self._kept:
-            values = [p.values[node.name] for p in self.slices]
+            values = [_values(p, node) for p in self.slices]
             apart = set(self.layout.apart) <= set(node.plates)
             if apart and self.whole:
                 shape = (self.particles, *node.value_shape)
@@ -208,6 +208,10 @@ class Block:
         np.subtract(rows, mean[..., None], out=off)
         np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
+        inner = self.slices[0].inner
+        if inner is not None and inner.has(node.name):
+            inside = [p.inner.moments_of(node)[1] for p in self.slices]
+            variance += self.weighted(self.turned(inside, self._axes(node)))
         if angles is not None:
             variance = np.where(angles, circular_variance(cosine, sine), variance)
             length = np.exp(-0.5 * variance)[..., None]
@@ -276,6 +280,13 @@ def diagnosed(slices: Sequence[Figures], lead: tuple[int, ...]) -> dict[str, np.
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _values(particles: Particles, node: CompiledNode) -> np.ndarray:
+    """What a mean is taken over: of what is integrated out, every particle's own mean."""
+    if particles.inner is not None and particles.inner.has(node.name):
+        return particles.inner.moments_of(node)[0]
+    return particles.values[node.name]
 
 
 def _unique(particles: Particles, lead: tuple[int, ...]) -> Any:

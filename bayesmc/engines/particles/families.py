@@ -72,11 +72,14 @@ class Scouts(NamedTuple):
         Relative to those of all particles together.
     share : float
         The sum of their weights, less that of the particles in such states.
+    inner : Gaussians or None
+        Their beliefs about what is integrated out.
     """
 
     values: dict[str, np.ndarray]
     log_weights: np.ndarray
     share: float
+    inner: Any = None
 
 
 class Families(NamedTuple):

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
+from bayesmc.engines.marginal import options as marginal
+from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
-from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
@@ -41,16 +43,15 @@ from bayesmc.engines.particles.options import (
     uncertain,
     warn_of_a_lonely_step,
     warn_of_what_is_not_guided,
+    without_functions,
 )
 from bayesmc.engines.particles.record import FilteredParticles, filtered_by
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
-from bayesmc.engines.particles.smc import quiet
 from bayesmc.engines.particles.smoothing import Backwards, backwards, by_lag
-from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
-from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
+from bayesmc.randomness import seed_sequence
 from bayesmc.resampling import Adaptive, checked, scheme_of
 from bayesmc.results.predictive import warn_of_misfit
 
@@ -108,6 +109,13 @@ class ParticleFilter(FilterEngine):
         is narrow. Particles are then resampled whenever their number changes.
     recovery : Recovery, optional
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
+
+    marginalize : "auto", sequence of str, or None
+        Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
+        given the sampled ones, each particle with a Kalman filter of its own, all in one array operation, and
+        weighted by the density of the row given these. ``"auto"``: all that can be, names: those, None: none.
+        ``explain`` says which, and why not more. With ``proposal="optimal"`` finite sampled nodes are drawn
+        given the row (the mixture Kalman filter). ``particles`` of such nodes are a draw from each filter.
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
@@ -181,6 +189,7 @@ class ParticleFilter(FilterEngine):
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
     adapt: KLD | None = None
     recovery: Recovery | None = None
+    marginalize: Any = None
     tolerance: float = TOLERANCE
     compiled: bool | None = None
     budget: int = BUDGET
@@ -195,30 +204,20 @@ class ParticleFilter(FilterEngine):
         check_numbers(self)
         scheme_of(self.resampling)
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
-        if self.compiled not in (None, True, False):
+        if self.compiled is not None and not isinstance(self.compiled, bool):
             raise ValueError(
                 f"ParticleFilter(compiled={self.compiled!r}): give True, False or None"
             )
         check_kind("adapt", self.adapt, KLD)
         check_kind("recovery", self.recovery, Recovery)
-        if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
-            raise TypeError(
-                f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
-                "log factors"
-            )
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
         check_together(self)
+        if self.marginalize is not None:
+            object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions."""
-        state = dict(self.__dict__)
-        for option in _FUNCTIONS:
-            if isinstance(state[option], Mapping):
-                state[option] = dict.fromkeys(state[option])
-        for option in ("resampling", "auxiliary"):
-            state[option] = None if callable(state[option]) else state[option]
-        return state
+        return without_functions(self, _FUNCTIONS)
 
     def __copy__(self) -> ParticleFilter:
         return self
@@ -243,20 +242,30 @@ class ParticleFilter(FilterEngine):
         if common is not None:
             return common
         asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
-        return refused(self, problem, asked)
+        why = None if self.marginalize is None else marginal.why_not(self, problem, asked)
+        return refused(self, problem, asked) if why is None else why
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
+        if asked.what == "fixed-lag" and self._integrates(problem):
+            return marginal.NOT_LAGGED
         sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
+    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        return marginal.reasons(self, problem)
+
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
+        if self._integrates(problem):
+            return marginal.told(self, problem, found)
         return found | looks_told(self, problem, found)
 
     def effort(self, problem: SeriesProblem) -> str:
-        step = self._sized(START).step_of(problem.slices, problem.known_static)
+        step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
+        if step.integrated:
+            return "a Kalman filter for each particle"
         return told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
@@ -275,7 +284,8 @@ class ParticleFilter(FilterEngine):
             raise ValueError(
                 f'keep={keep!r}: give "particles", or None for answers of constant size'
             )
-        warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
+        if not self._integrates(problem):
+            warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
             sized = self._sized(self._enough(problem, seed, keep is not None, progress))
             found = sized._passed(problem, seed, keep is not None, queries or {}, progress)
@@ -300,16 +310,15 @@ class ParticleFilter(FilterEngine):
             what = "or None for as many as there are particles, 1,000 at most"
             check_count("trajectories", trajectories, what, "smooth")
         check_choice("backward", backward, "rejection", "exact", "smooth")
-        if self.adapt is not None or self.recovery is not None:
-            raise UnsupportedError(NOT_SMOOTHED)
-        warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
+        why = self.unable(problem, Asked("smooth" if lag is None else "fixed-lag"))
+        if why is not None:
+            raise UnsupportedError(why)
+        if not self._integrates(problem):
+            warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
         else:
-            sums = endless(problem.slices, problem.seen)
-            if sums:
-                raise UnsupportedError(not_backwards(sums[0]))
             asked = Backwards(trajectories, backward == "rejection")
             found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
         self._warn(filtered)
@@ -321,31 +330,43 @@ class ParticleFilter(FilterEngine):
         slices: Slices,
         static: Mapping[str, np.ndarray],
         kept: Sequence[str] | None = None,
+        seen: Collection[str] = (),
     ) -> FilterStep:
-        """The step of this filter on a template, whose particles hold some nodes (all by default)."""
+        """The step of this filter on a template, whose particles hold some nodes (all by default).
+
+        ``seen`` are nodes that are seen in full in every slice.
+        """
         self._require_functions()
         scheme: Any = scheme_of(self.resampling)
         threshold = float(self.ess_threshold)
         if isinstance(scheme, Adaptive):
             scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
-        assert self.particles is not None
-        apart = plates_apart(slices)
-        if isinstance(self.proposal, str):
-            plan: SlicePlan = OptimalPlan(slices, apart, static)
-        else:
-            plan = SlicePlan(slices, apart, static, self._proposals(slices))
+        apart, count = plates_apart(slices), self.particles
+        assert count is not None
+        is_optimal = isinstance(self.proposal, str)
+        asked = None if is_optimal else self._proposals(slices)
+        if self.marginalize is not None:
+            split = marginal.split_asked(self, slices, static, seen)
+            if split is not None:
+                plan = SlicePlan(slices, apart, static)
+                return MarginalStep(plan, split, count, checked(scheme), threshold, kept, asked)
+        plan = (
+            OptimalPlan(slices, apart, static)
+            if is_optimal
+            else SlicePlan(slices, apart, static, asked)
+        )
         stage: Any = None
         if callable(self.auxiliary):
-            stage = GivenStage(plan, self.auxiliary, self.particles)
+            stage = GivenStage(plan, self.auxiliary, count)
         elif self.auxiliary:
-            stage = PluggedIn(plan, self.particles)
+            stage = PluggedIn(plan, count)
         renewed = None if self.rejuvenation is None else Rejuvenation(plan, self.rejuvenation)
-        injection = None if self.recovery is None else Injection(plan, self.recovery)
+        recovery: Recovery | None = self.recovery
+        injection = None if recovery is None else Injection(plan, recovery)
         wanted = kept if kept is None or self.adapt is None else [*kept, *self.adapt.widths]
         return FilterStep(
-            plan, self.particles, checked(scheme), threshold, stage, renewed, wanted, self.adapt,
-            injection,
-        )  # fmt: skip
+            plan, count, checked(scheme), threshold, stage, renewed, wanted, self.adapt, injection
+        )
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
         return ParticleBelief(dbn, seed_sequence(rng), static)
@@ -353,39 +374,16 @@ class ParticleFilter(FilterEngine):
     def _bound(
         self, belief: ParticleBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> ParticleBelief:
-        held, sized = len(belief.weights), self._sized(START)
-        most = sized.particles
-        assert most is not None
-        if held > most or (held < most and self.adapt is None):
-            raise ValueError(
-                f"ParticleFilter({most}).start: the belief has {held} particles; go on with the "
-                "engine that it was started with"
-            )
-        step = sized.step_of(slices, read_static(slices, belief.static))
-        return ParticleBelief(
-            dbn, belief.seed, belief.static, step, belief.now,
-            belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
-        )  # fmt: skip
+        return bound(self._sized(START), belief, dbn, slices)
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
-        step, tracker = belief.made_by, belief.tracker
-        if not isinstance(step, FilterStep):
-            step = self._sized(START).step_of(slices, read_static(slices, belief.static))
+        if self.marginalize is None and not isinstance(belief.made_by, FilterStep):
             warn_of_what_is_not_guided(self, slices, row.seen)
-        tracker = Tracker(step) if tracker is None else tracker
-        chance = belief.chance
-        rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
-        with quiet():
-            now = step(belief.now, row, rng)
-            families = tracker.after_one(belief.families, belief.now, now, row)
+        found = absorbed(self._sized(START), belief, slices, row)
         if self.particles is None:
-            warn_of_a_lonely_step(belief.now, belief.families, now)
-        total = belief.log_marginal_likelihood + now.increment
-        return ParticleBelief(
-            belief.dbn, belief.seed, belief.static, step, now,
-            total if np.ndim(total) else float(total), rng.bit_generator.state,
-            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
-        )  # fmt: skip
+            assert found.now is not None
+            warn_of_a_lonely_step(belief.now, belief.families, found.now)
+        return found
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -401,9 +399,14 @@ class ParticleFilter(FilterEngine):
         """All slices, one by one."""
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
-        step = self.step_of(problem.slices, problem.known_static, kept)
-        step = compiled_step(step, problem.steps, self.compiled)
+        step = self.step_of(problem.slices, problem.known_static, kept, problem.seen)
+        if not step.integrated:
+            step = compiled_step(step, problem.steps, self.compiled)
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
+
+    def _integrates(self, problem: SeriesProblem) -> bool:
+        """Whether anything is integrated out."""
+        return self.marginalize is not None and bool(marginal.split_of_problem(self, problem))
 
     def _sized(self, particles: int) -> ParticleFilter:
         """The same filter with so many particles, where their number was left out."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.particles.kld import KLD
+from bayesmc.engines.particles.rare_states import Scouting
 from bayesmc.engines.particles.rejuvenation import Injection
 from bayesmc.engines.particles.smc import BLOCK, Layout, Particles, Selection, SMCStep
 from bayesmc.engines.slice_steps import SlicePlan, size_of
@@ -51,6 +52,9 @@ class FilterStep(SMCStep):
         Lets a share of the particles begin anew.
     """
 
+    #: nodes that are integrated out, of which particles hold but a draw each
+    integrated: frozenset[str] = frozenset()
+
     def __init__(
         self,
         plan: SlicePlan,
@@ -71,7 +75,7 @@ class FilterStep(SMCStep):
             Layout(particles, plan.apart, lead, block), nodes, slices.interface,
             slices.dynamic if kept is None else kept, resample, threshold,
         )  # fmt: skip
-        self.plan, self.slices = plan, slices
+        self.plan, self.slices, self.is_guided = plan, slices, plan.guided
         self.steps, self.known = plan.steps, plan.known  # type: ignore[method-assign]
         self.first_stage, self.rejuvenate = first_stage, rejuvenate
         self.counts, self.injection = counts, injection
@@ -91,16 +95,20 @@ class FilterStep(SMCStep):
             mixed = self.injection.mixed(row, before, earlier, selection, passed, rng)
             (values, log, selection, injected), averages = mixed, earlier.averages
         found = self.weighted(row, values, log, selection)
-        if not _has_weight(found) and self.rejuvenate is not None:
+        if not has_weight(found) and self.rejuvenate is not None:
             steps = self.rejuvenate(row)
             found = self._renewed(steps, row, before, found, selection, rng)
-        if not _has_weight(found):
+        if not has_weight(found):
             raise self._degenerate(row, before, found.values, selection)
         if self.injection is None:
             return found
         if row.seen:
             averages = self.injection.options.averaged(averages, row, found.increment)
         return found._replace(averages=averages, injected=injected)
+
+    def scouting(self) -> Scouting:
+        """What sends scouts to states that next to no particle has."""
+        return Scouting(self.slices, self.plan)
 
     def log_first_stage(
         self, before: Mapping[str, np.ndarray], row: Row, rng: np.random.Generator
@@ -198,9 +206,7 @@ class FilterStep(SMCStep):
         )
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _has_weight(particles: Particles) -> bool:
+def has_weight(particles: Particles) -> bool:
+    """Whether any weight is left, in all elements of the plates apart."""
     total = particles.total
     return bool(total > 0 if isinstance(total, float) else (total > 0).all())

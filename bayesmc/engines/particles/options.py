@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import Queries
+from bayesmc.engines.marginal.options import split_of_problem
 from bayesmc.engines.particles.auxiliary import PluggedIn
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.optimal import guidance
@@ -126,6 +127,17 @@ def read_functions(option: str, given: Any) -> Any:
     return MappingProxyType(functions)
 
 
+def without_functions(engine: Any, options: Collection[str]) -> dict[str, Any]:
+    """Its state as pickles carry it; ``options`` are those that hold functions by node."""
+    state = dict(engine.__dict__)
+    for option in options:
+        if isinstance(state[option], Mapping):
+            state[option] = dict.fromkeys(state[option])
+    for option in ("resampling", "auxiliary"):
+        state[option] = None if callable(state[option]) else state[option]
+    return state
+
+
 def read_by(queries: Queries, slices: Slices) -> list[str]:
     """Nodes that queries read."""
     found = []
@@ -146,8 +158,11 @@ def check_together(engine: Any) -> None:
 
     Raises
     ------
-    ValueError
+    TypeError, ValueError
     """
+    if not isinstance(engine.auxiliary, bool) and not callable(engine.auxiliary):
+        what = "give True, False, or a function that returns log factors"
+        raise TypeError(f"ParticleFilter(auxiliary={engine.auxiliary!r}): {what}")
     if isinstance(engine.proposal, str) and engine.initial_proposal is not None:
         raise ValueError(
             'ParticleFilter: proposal="optimal" proposes for slice 0 too; leave initial_proposal= out'
@@ -189,10 +204,13 @@ def refused(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     if asked is not None:
         seen = problem.series.observed
         asked.check(seen.keys(), problem.seen)
+    split = None if engine.marginalize is None else split_of_problem(engine, problem)
+    filtered = () if split is None else (*split.below, *split.inner)
+    weighed = [n for n in whole(problem.series.observed) if n not in filtered]
     for model in (problem.slices.first, problem.slices.later):
         inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
         reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
-            model, whole(problem.series.observed), "ParticleFilter"
+            model, weighed, "ParticleFilter"
         )
         if reason is not None:
             return reason

@@ -72,7 +72,9 @@ class Replicates:
         self.names = tuple(problem.series.observed)
         self._wide = _numbers_seen(problem) >= WIDE
         self._looked, self._until = _chosen(problem, self._wide, rng, most), -1
-        self._cannot, self._broken = False, ""
+        # what is without noise has no density to be judged by
+        self._cannot = any(problem.slices.model(t)[n].noiseless for n in self.names for t in (0, 1))
+        self._broken = ""
         self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)
         self._rows, self._deficits = np.full(lead, np.nan), np.full(lead, np.nan)

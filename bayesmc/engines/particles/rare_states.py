@@ -66,8 +66,10 @@ class Scouting:
             parties += self._sent(unmet, earlier, now, row, rng)
         except BayesmcError:  # functions that break on what never came: nothing is said then
             return None
-        there = float(now.weights[_among(now.values, unmet)].sum() / now.total)
-        return _together([_away(p, unmet) for p in parties], there, rng)
+        if not parties:
+            return None
+        there = float(now.weights[among(now.values, unmet)].sum() / now.total)
+        return together([away(p, unmet) for p in parties], there, rng)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -105,7 +107,7 @@ class Scouting:
         """New scouts in the rare states of nodes, from particles that were in none of them."""
         before, carried = {}, -math.log(SCOUTS) - float(now.increment)
         if earlier is not None:
-            weights = np.where(_among(earlier.values, unmet), 0.0, earlier.weights)
+            weights = np.where(among(earlier.values, unmet), 0.0, earlier.weights)
             share = float(weights.sum() / earlier.total)
             if not share > 0:
                 return []
@@ -167,20 +169,7 @@ class _Put:
             state.weigh(level + np.log(weights.sum(axis=0)))
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _looked_at(slices: Slices) -> tuple[CompiledNode, ...]:
-    """Finite nodes that may be hidden: without plates, of few states."""
-    found = []
-    for name in slices.stochastic:
-        node = slices.later[name]
-        if node.domain is not None and not node.value_shape and node.domain.size <= STATES:
-            found.append(node)
-    return tuple(found[:NODES])
-
-
-def _among(
+def among(
     values: Mapping[str, np.ndarray], unmet: Sequence[tuple[CompiledNode, np.ndarray]]
 ) -> np.ndarray:
     """Who is in a rare state of some node."""
@@ -192,13 +181,13 @@ def _among(
     return np.asarray(found)
 
 
-def _away(scouts: Scouts, unmet: Sequence[tuple[CompiledNode, np.ndarray]]) -> Scouts:
+def away(scouts: Scouts, unmet: Sequence[tuple[CompiledNode, np.ndarray]]) -> Scouts:
     """The scouts that are where particles are rare; the others have done their work."""
-    away = _among(scouts.values, unmet)
+    away = among(scouts.values, unmet)
     return scouts._replace(log_weights=np.where(away, scouts.log_weights, -np.inf))
 
 
-def _together(parties: Sequence[Scouts], there: float, rng: np.random.Generator) -> Scouts | None:
+def together(parties: Sequence[Scouts], there: float, rng: np.random.Generator) -> Scouts | None:
     """All that have any weight as one party of bounded size, whose weights sum to the same."""
     log = np.concatenate([p.log_weights for p in parties])
     log = np.where(np.isnan(log), -np.inf, log)
@@ -211,4 +200,19 @@ def _together(parties: Sequence[Scouts], there: float, rng: np.random.Generator)
     names = parties[0].values
     values = {n: np.concatenate([p.values[n] for p in parties])[at] for n in names}
     even = np.full(SCOUTS, whole - math.log(SCOUTS))
-    return Scouts(values, even, max(math.exp(min(whole, 300.0)) - there, 0.0))
+    share = max(math.exp(min(whole, 300.0)) - there, 0.0)
+    inner = None if parties[0].inner is None else parties[0].inner.joined(parties, at)
+    return Scouts(values, even, share, inner)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _looked_at(slices: Slices) -> tuple[CompiledNode, ...]:
+    """Finite nodes that may be hidden: without plates, of few states."""
+    found = []
+    for name in slices.stochastic:
+        node = slices.later[name]
+        if node.domain is not None and not node.value_shape and node.domain.size <= STATES:
+            found.append(node)
+    return tuple(found[:NODES])

@@ -59,6 +59,8 @@ class Particles(NamedTuple):
         How well the last rows were explained, where recovery looks at that.
     injected : int
         Particles that recovery let begin anew.
+    inner : Gaussians or None
+        Beliefs about what is integrated out.
     """
 
     t: int
@@ -74,6 +76,7 @@ class Particles(NamedTuple):
     rejuvenated: Any = False
     averages: Averages | None = None
     injected: int = 0
+    inner: Any = None
 
 
 class Selection(NamedTuple):

@@ -35,7 +35,7 @@ def backwards(
     asked: Backwards,
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """Trajectories drawn backwards, and the filter's answer."""
-    step = engine.step_of(problem.slices, problem.known_static)
+    step = engine.step_of(problem.slices, problem.known_static, seen=problem.seen)
     filtered = filtered_by(engine, step, problem, seed, True, {}, progress)
     assert filtered.held is not None
     count = asked.trajectories or min(step.layout.particles, TRAJECTORIES)

@@ -31,7 +31,6 @@ from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.families import LONGEST, Drift, Families, Lost
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import SEEMS, begun, followed, rested, unremarkable
-from bayesmc.engines.particles.rare_states import Scouting
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.engines.particles.sums import MANY, NUMBERS, Moments, Summing, Tally
 from bayesmc.network import CompiledNode
@@ -71,14 +70,15 @@ class Tracker:
         nodes = [step.slices.later[n] for n in step.slices.interface]
         self.sight = Sight(nodes, step.layout)
         finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
-        self.scouting = Scouting(step.slices, step.plan) if finite else None
-        blind = step.plan.guided or step.first_stage is not None or step.injection is not None
-        compass = Compass(nodes, step.layout)
+        self.scouting = step.scouting() if finite else None
+        blind = step.is_guided or step.first_stage is not None or step.injection is not None
+        compass = Compass([n for n in nodes if n.name not in step.integrated], step.layout)
         self.compass = compass if compass.nodes and not blind else None
         # after a first stage, what a family should have is not what its weight says
         schemes = (stratified, systematic, ssp)
         self.steady = step.scheme in schemes or step.first_stage is not None
-        self._is_plain = self.steady and not step.layout.apart and self.scouting is None
+        plain = self.scouting is None and not step.integrated
+        self._is_plain = self.steady and not step.layout.apart and plain
 
     def after(
         self,

@@ -20,6 +20,9 @@ from bayesmc.engines.switching.stretches import Stretch
 from bayesmc.linalg.square_root import Conditioned, condition, condition_many, log_densities
 from bayesmc.lowering import GaussianLoops
 
+#: directions of a root that are shorter than this share of the longest, row by row, are known exactly
+_NOTHING = 1e-10
+
 
 class Place(NamedTuple):
     """A slice with its row.
@@ -181,14 +184,17 @@ class Back(NamedTuple):
     ----------
     log : ndarray, shape (pairs, *lead)
         Log probabilities of the mode before given this one and the rows before.
+    joint : ndarray, shape (pairs, *lead)
+        Log probabilities of both modes given the rows before, times the density of the row.
     after : Mixture
-        Of this slice, as the filter has them in every pair; of the numbers carried along.
+        Of this slice, as the filter has them in every pair.
     shift : ndarray, shape (pairs, *lead, carried)
     link : ndarray, shape (pairs, *lead, carried, carried)
     rest : ndarray, shape (pairs, *lead, carried, k)
     """
 
     log: np.ndarray
+    joint: np.ndarray
     after: Mixture
     shift: np.ndarray
     link: np.ndarray
@@ -202,18 +208,19 @@ def turned_back(before: Mixture, place: Place) -> Back:
     """
     stretch, pattern = place.stretch, place.pattern
     pairs, c = stretch.pairs, place.layout.n_prev
-    log = before.log[pairs.src] + stretch.log_of(place.at)
-    total, _ = shares(pairs.by_dst.logs(log))
+    ahead = before.log[pairs.src] + stretch.log_of(place.at)
+    total, _ = shares(pairs.by_dst.logs(ahead))
     own = total[pairs.dst]
-    log = np.where(own > -np.inf, log - np.where(own > -np.inf, own, 0.0), -np.inf)
+    log = np.where(own > -np.inf, ahead - np.where(own > -np.inf, own, 0.0), -np.inf)
     start = before.first(c)
     found = _taken(place, False, start.mean[pairs.src], start.factor[pairs.src], True)
     p, carried = len(pattern.observed), place.layout.carried
-    after = whole(place, Mixture(log, found.mean, found.factor)).first(carried)
+    after = whole(place, Mixture(log, found.mean, found.factor))
     assert found.made is not None and found.eta is not None and found.made.turn is not None
     turn = np.broadcast_to(found.made.turn, (*log.shape, *found.made.turn.shape[-2:]))
     return Back(
         log,
+        ahead + found.log,
         after,
         np.matvec(turn[..., :p], found.eta),
         turn[..., p : p + carried],
@@ -251,8 +258,9 @@ def smoothed(back: Back, place: Place, filtered: Mixture, later: Smoothed) -> Sm
     mean = filtered.mean[..., :c] + np.matvec(left, later.noise)
     root = left @ later.spread
     dst = pairs.dst
-    off = (mean[dst] - back.after.mean)[..., None]
-    noise, free = _noise_of(back.after.factor, np.concatenate([off, root[dst]], axis=-1))
+    after = back.after.first(c)
+    off = (mean[dst] - after.mean)[..., None]
+    noise, free = noise_of(after.factor, np.concatenate([off, root[dst]], axis=-1))
     found = back.link @ noise
     parts = [found[..., 1:], back.rest]
     if free is not None:
@@ -268,10 +276,24 @@ def smoothed(back: Back, place: Place, filtered: Mixture, later: Smoothed) -> Sm
     return Smoothed(*whole)
 
 
-# ---- private ------------------------------------------------------------------------------------
+def noise_of(factor: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """What noise makes numbers, shape (..., c, k), by a root; and noise that makes none, if there is some.
 
-#: directions of a root that are shorter than this share of the longest, row by row, are known exactly
-_NOTHING = 1e-10
+    Numbers of unlike units count alike.
+    """
+    size = np.sqrt(np.vecdot(factor, factor))
+    size = np.where(size > 0, size, 1.0)[..., None]
+    left, values, right = np.linalg.svd(factor / size)
+    longest = values[..., :1] if values.shape[-1] else values
+    kept = values > _NOTHING * longest
+    scaled = np.matrix_transpose(left) @ (numbers / size)
+    inner = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)[..., None] * scaled
+    turned = np.matrix_transpose(right)
+    free = None if kept.all() else turned * ~kept[..., None, :]
+    return turned @ inner, free
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _ahead(
@@ -302,20 +324,3 @@ def _ahead(
     kinds = len(pairs.of_kind)
     total, _ = shares(groups.logs(log))
     return Mixture(total, np.repeat(one.mean, kinds, axis=0), np.repeat(one.factor, kinds, axis=0))
-
-
-def _noise_of(factor: np.ndarray, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """What noise makes numbers, shape (..., c, k), by a root; and noise that makes none, if there is some.
-
-    Numbers of unlike units count alike.
-    """
-    size = np.sqrt(np.vecdot(factor, factor))
-    size = np.where(size > 0, size, 1.0)[..., None]
-    left, values, right = np.linalg.svd(factor / size)
-    longest = values[..., :1] if values.shape[-1] else values
-    kept = values > _NOTHING * longest
-    scaled = np.matrix_transpose(left) @ (numbers / size)
-    inner = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)[..., None] * scaled
-    turned = np.matrix_transpose(right)
-    free = None if kept.all() else turned * ~kept[..., None, :]
-    return turned @ inner, free

@@ -19,7 +19,16 @@ from bayesmc.engines.kalman.reading import reads_time
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.switching.merging import Mixture
 from bayesmc.engines.switching.modes import Modes
-from bayesmc.engines.switching.passes import Place, advanced, whole
+from bayesmc.engines.switching.passes import (
+    Back,
+    Place,
+    Smoothed,
+    advanced,
+    smoothed,
+    turned_back,
+    unsmoothed,
+    whole,
+)
 from bayesmc.engines.switching.posterior import Beliefs, SwitchingSeries, answers, by_modes
 from bayesmc.engines.switching.smoothing import last_rows, smoothed_back
 from bayesmc.engines.switching.stretches import Stretch
@@ -110,6 +119,26 @@ class SwitchingRun:
     def last_rows(self) -> np.ndarray:
         """The last slice with data so far, shape (time, *lead)."""
         return last_rows(self.data, self.modes, self.observed)
+
+    def completed(self, filtered: list[Mixture]) -> list[Mixture]:
+        """With all unknown numbers."""
+        return [whole(place, found) for place, found in zip(self.places, filtered, strict=True)]
+
+    def turned(self, filtered: list[Mixture]) -> list[Back | None]:
+        """How every slice but the first leads back to the one before."""
+        steps = range(1, self.data.steps)
+        return [None, *(turned_back(filtered[k - 1], self.places[k]) for k in steps)]
+
+    def noise(self, filtered: list[Mixture], backs: list[Back | None]) -> list[Smoothed]:
+        """Moments of the filter's noise given all rows, slice by slice."""
+        here = unsmoothed(filtered[-1], self.data.layouts[0].carried)
+        found = [here]
+        for k in range(self.data.steps - 1, 0, -1):
+            back = backs[k]
+            assert back is not None
+            here = smoothed(back, self.places[k], filtered[k], here)
+            found.append(here)
+        return found[::-1]
 
     @cached_property
     def places(self) -> list[Place]:

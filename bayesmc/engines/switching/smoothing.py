@@ -86,7 +86,7 @@ def smoothed_back(
             here = smoothed(backs[k], places[k], filtered[k], here)
             here = _begun(here, unsmoothed(filtered[k - 1], carried), last[end] < k)
             if lag is None or end == steps - 1 or k - 1 == end - lag:
-                found[k - 1] = _applied(filtered[k - 1], here)
+                found[k - 1] = applied(filtered[k - 1], here)
         if lag is not None:
             backs.pop(stop, None)
     return found
@@ -125,10 +125,19 @@ def warn_where_lost(
         f"smooth: in slice {start + t} the standard deviation of {node!r} is {growth.max():.2g} times the "
         "filtered one; rows are missing there, over which Kim's smoother loses which modes went with which "
         "numbers, and its answers about slices before and in such gaps are too wide: use "
-        "ParticleFilter(particles)",
+        "ExpectationPropagation() or ParticleFilter(particles)",
         EngineWarning,
         stacklevel=4,
     )
+
+
+def applied(filtered: Mixture, later: Smoothed) -> Mixture:
+    """Numbers whose noise has other moments than the filter's."""
+    c = later.noise.shape[-1]
+    left = filtered.factor[..., :c]
+    mean = filtered.mean + np.matvec(left, later.noise)
+    factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
+    return Mixture(later.log, mean, factor)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -151,12 +160,3 @@ def _begun(here: Smoothed, start: Smoothed, begins: np.ndarray) -> Smoothed:
         which = begins.reshape(1, *begins.shape, *(1,) * (own.ndim - 1 - begins.ndim))
         parts.append(np.where(which, other, own))
     return Smoothed(*parts)
-
-
-def _applied(filtered: Mixture, later: Smoothed) -> Mixture:
-    """Numbers whose noise has other moments than the filter's."""
-    c = later.noise.shape[-1]
-    left = filtered.factor[..., :c]
-    mean = filtered.mean + np.matvec(left, later.noise)
-    factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
-    return Mixture(later.log, mean, factor)

@@ -1,0 +1,155 @@
+"""``ParticleFilter(marginalize=)``: read, refused, told, and the step that it makes."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
+from bayesmc.engines.marginal.choices import MOST
+from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.slice_steps import SliceProposals, plates_apart
+from bayesmc.errors import UnsupportedError
+
+#: why fixed lags are not answered
+NOT_LAGGED = (
+    "ParticleFilter: lag= answers by the ancestors of later particles, and these tell nothing of what "
+    "marginalize= integrates out; smooth without lag=, or give marginalize=None"
+)
+_SEEN = "observed, weights the particles by its predictive density"
+#: options that do not go with it
+_ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
+
+
+def read_marginalize(engine: Any) -> Any:
+    """``"auto"``, a tuple of names, or None.
+
+    Raises
+    ------
+    TypeError, ValueError
+    """
+    given = engine.marginalize
+    if given is None:
+        return None
+    names = (given,) if isinstance(given, str) else given
+    if not isinstance(names, (list, tuple)) or not all(isinstance(n, str) for n in names):
+        raise TypeError(
+            f'ParticleFilter(marginalize={given!r}): give "auto", names of hidden nodes, or None'
+        )
+    if not names:
+        raise ValueError(
+            "ParticleFilter(marginalize=[]): nothing is named; give None to sample all that is hidden"
+        )
+    for option in _ALONE:
+        if getattr(engine, option):
+            raise ValueError(
+                f"ParticleFilter: marginalize= and {option}= do not go together; leave one of them out"
+            )
+    if engine.compiled:
+        raise ValueError(
+            "ParticleFilter: what marginalize= integrates out has no machine code; leave compiled= out"
+        )
+    return AUTO if given == AUTO else tuple(dict.fromkeys(names))
+
+
+def split_asked(
+    engine: Any, slices: Slices, static: Mapping[str, np.ndarray], seen: Collection[str]
+) -> Split | None:
+    """What is integrated out; None where nothing is.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    if engine.marginalize is None:
+        return None
+    known = frozenset(n for n in slices.stochastic if n in seen)
+    found = split_of(slices, known, engine.marginalize, static)
+    return found if found.inner else None
+
+
+def split_of_problem(engine: Any, problem: SeriesProblem) -> Split | None:
+    """The same for a series."""
+    return split_asked(engine, problem.slices, problem.known_static, problem.seen)
+
+
+def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:
+    """Why ``marginalize=`` cannot be followed, or None.
+
+    ``asked`` are the proposals.
+    """
+    try:
+        split = split_of_problem(engine, problem)
+    except UnsupportedError as error:
+        return f"ParticleFilter: {error}"
+    if split is None:
+        return None
+    slices = problem.slices
+    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.inner]
+    if engine.proposal == "optimal":
+        wrong = next((n for n in sampled if slices.later[n].domain is None), None)
+        if wrong is not None:
+            return (
+                'ParticleFilter: with marginalize=, proposal="optimal" draws finite nodes given the row, and '
+                f"{wrong!r}, which is sampled, is not finite; give proposal={{...}}, or leave it out"
+            )
+        count = 1.0
+        for name in sampled:
+            node = slices.later[name]
+            assert node.domain is not None
+            sizes = zip(node.plates, node.plate_shape, strict=True)
+            others = [k for p, k in sizes if p not in plates_apart(slices)]
+            count *= float(node.domain.size) ** float(np.prod(others))
+        if count > MOST:
+            return (
+                f'ParticleFilter: with marginalize=, proposal="optimal" goes through the joint states of '
+                f"{', '.join(map(repr, sampled))}, which are {count:.4g}, more than {MOST}; "
+                "leave proposal= out"
+            )
+        return None
+    for proposal in [] if asked is None else [*asked.first, *asked.later]:
+        names = (*proposal.names, *proposal.parents)
+        inner = next((n for n in names if n.removesuffix(PREVIOUS) in split.inner), None)
+        if inner is not None:
+            return (
+                f"{proposal.what} names {inner!r}, which marginalize= integrates out, so no particle has a "
+                "value of it; name sampled nodes"
+            )
+    return None
+
+
+def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
+    """Why this engine is taken, where something is integrated out."""
+    split = split_of_problem(engine, problem)
+    if split is None:
+        return ()
+    inner = ", ".join(repr(n) for n in split.inner if n not in problem.series.observed)
+    return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
+
+
+def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
+    """What is done to each node, given what plain particles do to it."""
+    split = split_of_problem(engine, problem)
+    found = dict(treated)
+    if split is None:
+        return found
+    slices = problem.slices
+    each = "a Kalman filter for each particle"
+    if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
+        each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
+    for name in slices.dynamic:
+        if name in split.inner:
+            found[name] = f"integrated out, {each}"
+            if name in problem.series.observed:
+                found[name] = f"{_SEEN}; integrated out where it is missing"
+        elif name in split.below:
+            found[name] = _SEEN
+        elif name in split.why:
+            found[name] += f"; not integrated out: {split.why[name]}"
+        elif (
+            engine.proposal == "optimal" and name in slices.stochastic and name not in problem.seen
+        ):
+            found[name] = "sampled given the slice before and the row"
+    return found
