@@ -310,15 +310,11 @@ def common_refusal(engine: FilterEngine | str, problem: SeriesProblem) -> str | 
     if not problem.unknown_static:
         return None
     names = ", ".join(map(repr, problem.unknown_static))
-    own = isinstance(engine, FilterEngine)
-    takes = (
-        f"{type(engine).__name__} takes static nodes as known"
-        if own
-        else f"{engine} infers static nodes"
-    )
+    known = "infers static nodes" if isinstance(engine, str) else "takes static nodes as known"
+    who = engine if isinstance(engine, str) else type(engine).__name__
     return (
-        f"{takes}, and {names} is not observed; observe it (its value in observations=), or infer it with the "
-        "trajectory: infer(dbn, observations), by itself or with engine=ParticleGibbs(draws), "
+        f"{who} {known}, and {names} is not observed; observe it (its value in observations=), or infer it "
+        "with the trajectory: infer(dbn, observations), by itself or with engine=ParticleGibbs(draws), "
         "ParticleMetropolis(draws) or another static engine"
     )
 

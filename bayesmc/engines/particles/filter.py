@@ -264,9 +264,8 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
-        if step.integrated:
-            return "a Kalman filter for each particle"
-        return told(step, problem, self.compiled)
+        filters = "a Kalman filter for each particle"
+        return filters if step.integrated else told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
         return self.effort(problem) if asked.what == "filter" else ""
