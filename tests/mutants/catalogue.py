@@ -10,6 +10,7 @@ from tests.mutants import (
     factored,
     filters,
     hamiltonian,
+    lagging,
     slices,
     switching,
 )
@@ -23,6 +24,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *switching.MUTANTS,
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
+    *lagging.MUTANTS,
     *slices.MUTANTS,
     *densities.MUTANTS,
 )

@@ -351,7 +351,7 @@ MUTANTS = [
     Mutant(
         "covariances are not resampled",
         (Edit("bayesmc.engines.marginal.gaussians:Gaussians.taken",
-              "which = self.which.take(ancestors)", "which = self.which[: len(ancestors)]"),),
+              "which=self.which.take(ancestors)", "which=self.which[: len(ancestors)]"),),
         evidence_of(shaken, BLIND,
                     bmc.ParticleFilter(100, marginalize="auto", ess_threshold=2.0), 200),
         "unbiased_evidence_test, 200 runs of 100 particles",

@@ -18,7 +18,8 @@ from bayesmc.engines.kalman.covariances import full_factor, without_absent
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.means import absorbed
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.linalg.square_root import Conditioned, condition_many
+from bayesmc.engines.marginal.lagging import Lagged, Turned
+from bayesmc.linalg.square_root import Conditioned, condition, condition_many
 from bayesmc.network import CompiledNode
 
 #: kinds of coefficients up to which all of them are applied to all means, by one product of matrices
@@ -40,6 +41,8 @@ class Gaussians(NamedTuple):
         Nodes that are taken to be seen in full in every slice.
     over : tuple of ndarray or None, shapes (particles, *lead, n)
         Means and variances over the choices that each particle had, of which one was drawn.
+    past : tuple of Lagged
+        Beliefs about this slice and some before it, given the same rows.
     """
 
     layout: Layout
@@ -48,24 +51,24 @@ class Gaussians(NamedTuple):
     which: np.ndarray | None
     seen: frozenset[str] = frozenset()
     over: tuple[np.ndarray, np.ndarray] | None = None
+    past: tuple[Lagged, ...] = ()
 
     def taken(self, ancestors: np.ndarray | None) -> Gaussians:
         """Those of the ancestors, which may differ between elements of plates."""
         if ancestors is None:
             return self._replace(over=None)
+        past = tuple(p.taken(ancestors, self.which) for p in self.past)
+        found = self._replace(over=None, past=past)
         if ancestors.ndim == 1:
             mean = self.mean.take(ancestors, axis=0)
             if self.which is None:
-                factors = self.factors.take(ancestors, axis=0)
-                return Gaussians(self.layout, mean, factors, None, self.seen)
-            which = self.which.take(ancestors)
-            return Gaussians(self.layout, mean, self.factors, which, self.seen)
+                return found._replace(mean=mean, factors=self.factors.take(ancestors, axis=0))
+            return found._replace(mean=mean, which=self.which.take(ancestors))
         mean = np.take_along_axis(self.mean, ancestors[..., None], 0)
         if self.which is not None and len(self.factors) == 1:
-            which = np.zeros(len(mean), dtype=np.intp)
-            return Gaussians(self.layout, mean, self.factors, which, self.seen)
+            return found._replace(mean=mean, which=np.zeros(len(mean), dtype=np.intp))
         factors = np.take_along_axis(self.roots(), ancestors[..., None, None], 0)
-        return Gaussians(self.layout, mean, factors, None, self.seen)
+        return found._replace(mean=mean, factors=factors, which=None)
 
     def roots(self) -> np.ndarray:
         """Every particle's own, shape (particles, *lead, n, m)."""
@@ -79,7 +82,14 @@ class Gaussians(NamedTuple):
         """Some of those of several parties, one after the other."""
         means = np.concatenate([p.inner.mean for p in parties])
         roots = np.concatenate([p.inner.roots() for p in parties])
-        return self._replace(mean=means[at], factors=roots[at], which=None, over=None)
+        return self._replace(mean=means[at], factors=roots[at], which=None, over=None, past=())
+
+    def back(self, slices: int) -> Gaussians:
+        """Those about so many slices before, given the same rows."""
+        if not slices:
+            return self
+        own = self.past[slices]
+        return Gaussians(own.layout, own.mean, own.factors(), self.which, self.seen)
 
     def carried(self) -> Gaussians:
         """Of the numbers that the next slice reads."""
@@ -138,6 +148,22 @@ class Coefficients(NamedTuple):
     noise: np.ndarray
     kind: np.ndarray | None
 
+    def chosen(self, choice: np.ndarray) -> Coefficients:
+        """Those of one choice for each particle, shape (particles, *lead)."""
+        at = choice[:, None, ..., None]
+        offset = np.take_along_axis(self.offset, at, 1)
+        if choice.ndim == 1 and self.kind is not None:
+            count = self.moves.shape[1]
+            own, kind = np.unique(self.kind * count + choice, return_inverse=True)
+            places = own // count, own % count
+            moves, noise = (a[places][:, None] for a in (self.moves, self.noise))
+            return Coefficients(offset, moves, noise, kind)
+        every = (self.moves, self.noise)
+        if self.kind is not None:
+            every = self.moves.take(self.kind, axis=0), self.noise.take(self.kind, axis=0)
+        moves, noise = (np.take_along_axis(a, at[..., None], 1) for a in every)
+        return Coefficients(offset, moves, noise, None)
+
 
 class Taken(NamedTuple):
     """A slice with its row, for each particle and choice.
@@ -150,6 +176,8 @@ class Taken(NamedTuple):
     mean : ndarray, shape (particles, choices, *lead, n)
     factors : ndarray, shape (groups, choices, *lead, n, m)
     group : ndarray of int, shape (particles,), or None
+    turned : Turned or None
+        What the row tells of the slices before, where it was asked for.
     """
 
     layout: Layout
@@ -157,6 +185,7 @@ class Taken(NamedTuple):
     mean: np.ndarray
     factors: np.ndarray
     group: np.ndarray | None
+    turned: Turned | None = None
 
     def averaged(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and variances over choices, by their shares, shape (particles, choices, *lead)."""
@@ -199,6 +228,7 @@ def take_in(
     found: Coefficients,
     row: np.ndarray,
     given: np.ndarray | None,
+    looks_back: bool = False,
 ) -> Taken:
     """The slice after ``before``, given its row.
 
@@ -209,6 +239,8 @@ def take_in(
     row : ndarray, shape (*lead, observed)
     given : ndarray, shape (*lead, n), or None
         Values of numbers that are observed in part.
+    looks_back : bool
+        Whether it is wanted what the row tells of the slices before.
     """
     n, chosen = len(before.mean), pattern.chosen
     offset, moves, noise = (
@@ -216,8 +248,13 @@ def take_in(
         found.moves[..., chosen, :],
         found.noise[..., chosen, :],
     )
-    left, of_kind, group = _grouped(before, found.kind, len(moves))
-    made = _conditioned(pattern, left, moves, noise, of_kind)
+    at, of_kind, group = _grouped(before, found.kind, len(moves))
+    left = before.factors[at]
+    rows = _rows(pattern, left, moves[of_kind], noise[of_kind])
+    if looks_back:
+        made = condition(rows, len(pattern.observed), left.shape[-1])
+    else:
+        made = condition_many(rows, len(pattern.observed))
     mean = _expected(before.mean, offset, moves, found.kind)
     own = made
     if group is not None and len(made.root) > 1:
@@ -225,50 +262,52 @@ def take_in(
         root, gain = made.root.take(group, axis=0), made.gain.take(group, axis=0)
         own = Conditioned(root, gain, made.factor, None, certain)
     terms = _sizes(before.mean, offset, moves, found.kind)
-    after, _, log = absorbed(layout, pattern, own, mean, row, given, terms=terms)
+    after, eta, log = absorbed(layout, pattern, own, mean, row, given, terms=terms)
     factors = full_factor(layout, pattern, made.factor)
     count = moves.shape[1]
     log = np.broadcast_to(log, (n, count, *layout.lead))
-    return Taken(layout, log, after, factors, group)
+    turned = None
+    if made.turn is not None:
+        turned = Turned(made.turn[:, 0], eta[:, 0], at, made.factor.shape[-1], factors.shape[-1])
+    return Taken(layout, log, after, factors, group, turned)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
+#: places in an array: positions, or all
+_Places = np.ndarray | slice
+
+
 def _grouped(
     before: Gaussians, kind: np.ndarray | None, kinds: int
-) -> tuple[np.ndarray, np.ndarray | slice, np.ndarray | None]:
-    """Roots and kinds of the particles that differ in either, and which of them each particle is."""
+) -> tuple[_Places, _Places, np.ndarray | None]:
+    """Roots in the pool and kinds of particles that differ in either, and which each particle has."""
     alone = before.which is None or kind is None
+    every = slice(None)
     if alone and not (kinds == 1 and before.which is None):
-        every = slice(None) if kind is None else kind
-        return before.roots(), every, None
+        return (
+            every if before.which is None else before.which,
+            every if kind is None else kind,
+            None,
+        )
     if before.which is None:
-        return before.factors, np.zeros(len(before.factors), dtype=np.intp), None
+        return every, np.zeros(len(before.factors), dtype=np.intp), None
     assert kind is not None
     if kinds == 1 and len(before.factors) == 1:
-        return before.factors, np.zeros(1, dtype=np.intp), before.which
+        return every, np.zeros(1, dtype=np.intp), before.which
     pairs, group = np.unique(before.which * kinds + kind, return_inverse=True)
-    return before.factors.take(pairs // kinds, axis=0), pairs % kinds, group
+    return pairs // kinds, pairs % kinds, group
 
 
-def _conditioned(
-    pattern: Pattern,
-    left: np.ndarray,
-    moves: np.ndarray,
-    noise: np.ndarray,
-    of_kind: np.ndarray | slice,
-) -> Conditioned:
-    """Each group and choice made triangular."""
-    moves, noise = moves[of_kind], noise[of_kind]
+def _rows(pattern: Pattern, left: np.ndarray, moves: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Of each group and choice: coefficients of the noise before and of its own."""
     count, c = moves.shape[1], left.shape[-1]
     shape = (len(left), count, *noise.shape[2:-1])
     rows = np.zeros((*shape, c + noise.shape[-1]))
     np.matmul(moves, left[:, None], out=rows[..., :c])
     rows[..., c:] = noise
-    if pattern.absent is not None:
-        rows = without_absent(rows, pattern.absent)
-    return condition_many(rows, len(pattern.observed))
+    return rows if pattern.absent is None else without_absent(rows, pattern.absent)
 
 
 def _expected(

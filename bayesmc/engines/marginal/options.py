@@ -13,11 +13,6 @@ from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
-#: why fixed lags are not answered
-NOT_LAGGED = (
-    "ParticleFilter: lag= answers by the ancestors of later particles, and these tell nothing of what "
-    "marginalize= integrates out; smooth without lag=, or give marginalize=None"
-)
 _SEEN = "observed, weights the particles by its predictive density"
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")

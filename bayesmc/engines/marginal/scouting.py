@@ -115,7 +115,7 @@ class MarginalScouting(Scouting):
             shared = value.ndim == len(self.slices.later[name].value_shape)
             (plain if shared else own)[name + PREVIOUS] = value
         known = Values(plain, own, count)
-        joint, made = step.looked(place, choices, row, known, before)
+        joint, made, _ = step.looked(place, choices, row, known, before)
         if unmet is not None:
             rare = among(choices.values, unmet)
             joint = np.where(rare, joint, -np.inf)

@@ -22,7 +22,8 @@ from bayesmc.dbn import Row
 from bayesmc.engines.kalman.data import Pattern, given_values, pattern_of, stacked
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.marginal.choices import Choices
-from bayesmc.engines.marginal.gaussians import Gaussians, Taken, nothing, take_in
+from bayesmc.engines.marginal.gaussians import Coefficients, Gaussians, Taken, nothing, take_in
+from bayesmc.engines.marginal.lagging import newest, told_more
 from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split, blocks_of
@@ -148,26 +149,45 @@ class MarginalStep(FilterStep):
         if place.choices is None:
             pattern, target, given = seen_of(place.layout, row)
             coefficients = place.reader.read(known)
-            made = take_in(place.layout, pattern, inner, coefficients, target, given)
+            made = take_in(place.layout, pattern, inner, coefficients, target, given, self.lag > 0)
             own = made.log[:, 0]
             if self.blocks:
                 own = own.sum(axis=tuple(range(1, own.ndim)))
-            return values, log + own, made.chosen(None)
-        joint, made = self.looked(place, place.choices, row, known, inner)
+            return values, log + own, self._looking_back(inner, made, made.chosen(None), pattern)
+        joint, made, coefficients = self.looked(place, place.choices, row, known, inner)
         own, at = place.choices.drawn(joint, rng)
         values |= self.chosen_values(place, place.choices, known, values, at)
         level = np.where(own > -np.inf, own, 0.0)
         over = made.averaged(np.exp(joint - level[:, None]))
-        return values, log + own, made.chosen(at)._replace(over=over)
+        after = made.chosen(at)
+        if self.lag:
+            after = self._again(place, row, inner, coefficients.chosen(at))
+        return values, log + own, after._replace(over=over)
+
+    def _again(self, place: Place, row: Row, before: Gaussians, chosen: Coefficients) -> Gaussians:
+        """The row taken in with what was drawn, which tells of the slices before, too."""
+        pattern, target, given = seen_of(place.layout, row)
+        made = take_in(place.layout, pattern, before, chosen, target, given, True)
+        return self._looking_back(before, made, made.chosen(None), pattern)
+
+    def _looking_back(
+        self, before: Gaussians, made: Taken, after: Gaussians, pattern: Pattern
+    ) -> Gaussians:
+        """With beliefs about the slices before, as many as later answers are about."""
+        if made.turned is None:
+            return after
+        past = before.past[: self.lag]
+        found = told_more(past, made.turned, made.group, len(pattern.observed))
+        return after._replace(past=(newest(after.layout, after.mean, after.factors), *found))
 
     def looked(
         self, place: Place, choices: Choices, row: Row, known: Values, inner: Gaussians
-    ) -> tuple[np.ndarray, Taken]:
+    ) -> tuple[np.ndarray, Taken, Coefficients]:
         """The row taken in with every choice of finite nodes; logs have shape (particles, choices, *lead)."""
         pattern, target, given = seen_of(place.layout, row)
         prior, coefficients = choices.read(known, row, place.reader)
         made = take_in(place.layout, pattern, inner, coefficients, target, given)
-        return prior + made.log, made
+        return prior + made.log, made, coefficients
 
     def chosen_values(
         self,

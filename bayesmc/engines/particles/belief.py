@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.smc import Bare, Particles, quiet
+from bayesmc.engines.particles.smoothing import looked_back
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode
@@ -29,7 +32,10 @@ class ParticleBelief(OnlineBelief):
     Attributes
     ----------
     t : int
-        The slice; -1 before anything was absorbed.
+        The slice whose row was absorbed last; -1 before anything was.
+    about : int
+        The slice that answers are about: ``t``, or so many before as ``delay=`` says, at the soonest the
+        first (see ``back``).
     log_marginal_likelihood : float or ndarray
         Log density of all rows absorbed so far.
     log_marginal_likelihood_mcse : float or ndarray
@@ -70,6 +76,7 @@ class ParticleBelief(OnlineBelief):
         inputs: Mapping[str, np.ndarray] | None = None,
         families: Families | None = None,
         tracker: Tracker | None = None,
+        window: tuple[Particles, ...] = (),
     ) -> None:
         self.dbn, self.seed, self.static = dbn, seed, dict(static)
         self.made_by, self.now, self.chance = made_by, now, chance
@@ -77,12 +84,55 @@ class ParticleBelief(OnlineBelief):
         self.families, self.tracker = families, tracker
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if now is None else now.t
+        #: slices that can be answered for, from the first on; this one alone without a delay
+        self.window = window or (() if now is None else (now,))
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
         step = self.made_by
         bare = None if step is None else Bare(step.slices, step.layout)
-        return {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None}
+        state = {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None}
+        state.pop("_particles", None)
+        return state
+
+    @property
+    def about(self) -> int:
+        """The slice that answers are about."""
+        return -1 if self.now is None else self.window[0].t
+
+    def back(self, slices: int) -> ParticleBelief:
+        """What is believed now about so many slices before the last, as many as ``delay=`` says at most.
+
+        It answers as this belief does; go on by ``step`` with this one.
+
+        Raises
+        ------
+        QueryError
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+        >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+        >>> engine = bmc.ParticleFilter(1000, delay=2)
+        >>> belief = engine.start(dbn, rng=0)
+        >>> for y in [0.8, 1.0, 0.7, 1.2]:
+        ...     belief = engine.step(belief, {"y": y})
+        >>> belief.t, belief.about, belief.back(0).about
+        (3, 1, 3)
+        """
+        count = len(self.window)
+        if slices not in range(count):
+            raise QueryError(
+                f"back({slices!r}): it answers for the last {count} slices, 0 to {count - 1} back; "
+                "for more give ParticleFilter(delay=...)"
+            )
+        found = copy.copy(self.__dict__)
+        found.pop("_particles", None)
+        other = object.__new__(type(self))
+        other.__dict__.update(found, window=self.window[count - 1 - slices :])
+        return other
 
     @property
     def slices(self) -> Slices | None:
@@ -188,18 +238,25 @@ class ParticleBelief(OnlineBelief):
     def __repr__(self) -> str:
         if self.now is None:
             return "ParticleBelief(nothing absorbed yet)"
-        ess = np.round(self.weight_ess, 1)
-        return f"ParticleBelief(t={self.t}, {len(self._particles.weights)} particles, ess={ess})"
+        ess, late = np.round(self.weight_ess, 1), ""
+        if self.about < self.t:
+            late = f"about={self.about}, "
+        return (
+            f"ParticleBelief(t={self.t}, {late}{len(self._particles.weights)} particles, ess={ess})"
+        )
 
     # ---- private -------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def _particles(self) -> Particles:
         if self.now is None:
             raise QueryError(
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
             )
-        return self.now
+        if len(self.window) < 2:
+            return self.now
+        with quiet():
+            return looked_back((*self.window[:-1], self.now), self._step, self.seed)
 
     @property
     def _answers(self) -> Answers:
@@ -237,9 +294,11 @@ def bound(
     inner = None if belief.now is None else belief.now.inner
     seen = () if inner is None else inner.seen
     step = engine.step_of(slices, read_static(slices, belief.static), seen=seen)
+    step.lag = engine.delay or 0
     return ParticleBelief(
         dbn, belief.seed, belief.static, step, belief.now,
         belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
+        window=belief.window,
     )  # fmt: skip
 
 
@@ -249,6 +308,7 @@ def absorbed(engine: Any, belief: ParticleBelief, slices: Slices, row: Row) -> P
     if not isinstance(step, FilterStep):
         full = [n for n, o in row.seen.items() if o.mask is None]
         step = engine.step_of(slices, read_static(slices, belief.static), seen=full)
+        step.lag = engine.delay or 0
     tracker = Tracker(step) if tracker is None else tracker
     chance = belief.chance
     rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
@@ -256,8 +316,11 @@ def absorbed(engine: Any, belief: ParticleBelief, slices: Slices, row: Row) -> P
         now = step(belief.now, row, rng)
         families = tracker.after_one(belief.families, belief.now, now, row)
     total = belief.log_marginal_likelihood + now.increment
+    known = step.lag if now.inner is None else min(step.lag, len(now.inner.past) - 1)
+    before = belief.window[-known:] if known > 0 else ()
+    bare = tuple(p._replace(inner=None) for p in before)  # the newest knows of all before
     return ParticleBelief(
         belief.dbn, belief.seed, belief.static, step, now,
         total if np.ndim(total) else float(total), rng.bit_generator.state,
-        {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
+        {n: row.inputs[n] for n in slices.template.inputs}, families, tracker, (*bare, now),
     )  # fmt: skip

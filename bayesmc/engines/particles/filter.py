@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -17,6 +16,7 @@ from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound
 from bayesmc.engines.particles.compiled_step import compiled_step, told
+from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_delay
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
@@ -31,7 +31,6 @@ from bayesmc.engines.particles.options import (
     check_kind,
     check_numbers,
     check_together,
-    collapsed,
     described,
     enough,
     looks_told,
@@ -40,17 +39,18 @@ from bayesmc.engines.particles.options import (
     read_by,
     read_functions,
     refused,
-    uncertain,
     warn_of_a_lonely_step,
+    warn_of_errors,
     warn_of_what_is_not_guided,
-    without_functions,
 )
-from bayesmc.engines.particles.record import FilteredParticles, filtered_by
+from bayesmc.engines.particles.pickling import require_functions, without_functions
+from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
+from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.smoothing import Backwards, backwards, by_lag
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
+from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.resampling import Adaptive, checked, scheme_of
 from bayesmc.results.predictive import warn_of_misfit
@@ -116,6 +116,11 @@ class ParticleFilter(FilterEngine):
         weighted by the density of the row given these. ``"auto"``: all that can be, names: those, None: none.
         ``explain`` says which, and why not more. With ``proposal="optimal"`` finite sampled nodes are drawn
         given the row (the mixture Kalman filter). ``particles`` of such nodes are a draw from each filter.
+    delay : int, optional
+        How many rows answers look ahead: those for slice t are given the rows up to t + delay (at the end
+        what there is), by the weights of slice t + delay on the ancestors in t; beliefs about what is
+        integrated out take these rows in, too. Ancestors are few where the delay is long. Beliefs of ``step``
+        answer as late (``about``, ``back``).
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
@@ -166,7 +171,7 @@ class ParticleFilter(FilterEngine):
     Gordon, Salmond and Smith (1993), IEE Proceedings F 140; Koller and Friedman (2009), sec. 15.3.3
     (LW-2TBN); Doucet and Johansen (2011), A tutorial on particle filtering and smoothing; Pitt and Shephard
     (1999), JASA 94; Okuma et al. (2004), A boosted particle filter; Chan and Lai (2013), Ann. Statist. 41;
-    Lee and Whiteley (2018), Variance estimation in the particle filter, Biometrika 105.
+    Lee and Whiteley (2018), Biometrika 105; Chen, Wang and Liu (2000), IEEE IT 46 (delayed weights).
 
     Examples
     --------
@@ -190,6 +195,7 @@ class ParticleFilter(FilterEngine):
     adapt: KLD | None = None
     recovery: Recovery | None = None
     marginalize: Any = None
+    delay: int | None = None
     tolerance: float = TOLERANCE
     compiled: bool | None = None
     budget: int = BUDGET
@@ -213,8 +219,8 @@ class ParticleFilter(FilterEngine):
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
         check_together(self)
-        if self.marginalize is not None:
-            object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
+        object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
+        object.__setattr__(self, "delay", read_delay(self))
 
     def __getstate__(self) -> dict[str, Any]:
         return without_functions(self, _FUNCTIONS)
@@ -225,19 +231,8 @@ class ParticleFilter(FilterEngine):
     def __deepcopy__(self, memo: Any) -> ParticleFilter:
         return self
 
-    def _require_functions(self) -> None:
-        given = [self.resampling, self.auxiliary]
-        for option in _FUNCTIONS:
-            functions = getattr(self, option)
-            given += functions.values() if isinstance(functions, Mapping) else ()
-        whole = self.recovery is None or self.recovery.is_whole
-        if not whole or any(value is None for value in given):
-            raise UnsupportedError(
-                "ParticleFilter: this engine was unpickled, and pickles carry no functions; make it anew"
-            )
-
     def refusal(self, problem: SeriesProblem) -> str | None:
-        self._require_functions()
+        require_functions(self, _FUNCTIONS)
         common = super().refusal(problem)
         if common is not None:
             return common
@@ -248,8 +243,8 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if asked.what == "fixed-lag" and self._integrates(problem):
-            return marginal.NOT_LAGGED
+        if (why := not_delayed(self.delay, asked)) is not None:
+            return why
         sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
@@ -264,11 +259,12 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
-        filters = "a Kalman filter for each particle"
-        return filters if step.integrated else told(step, problem, self.compiled)
+        each = "a Kalman filter for each particle"
+        return each if step.integrated else told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
-        return self.effort(problem) if asked.what == "filter" else ""
+        found = self.effort(problem) if asked.what == "filter" else ""
+        return ahead_told(self.delay, found)
 
     def filter(
         self,
@@ -287,11 +283,15 @@ class ParticleFilter(FilterEngine):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
             sized = self._sized(self._enough(problem, seed, keep is not None, progress))
-            found = sized._passed(problem, seed, keep is not None, queries or {}, progress)
+            whole = keep is not None, queries or {}, progress
+            if self.delay is None:
+                found = filtered = sized._passed(problem, seed, *whole)
+            else:
+                found, filtered = by_lag(sized, problem, seed, self.delay, *whole, "filter")
         except KeyboardInterrupt as stop:
-            found = answer_so_far(stop, self)
-        self._warn(found)
-        warn_of_misfit(found.predictive, type(self).__name__, found.start, 3)
+            found = filtered = answer_so_far(stop, self)
+        warn_of_errors(filtered, self)
+        warn_of_misfit(filtered.predictive, type(self).__name__, found.start, 3)
         return found
 
     def smooth(
@@ -316,11 +316,11 @@ class ParticleFilter(FilterEngine):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
-            found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
+            found, filtered = by_lag(sized, problem, seed, lag, False, queries or {}, progress)
         else:
             asked = Backwards(trajectories, backward == "rejection")
             found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
-        self._warn(filtered)
+        warn_of_errors(filtered, self)
         warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
 
@@ -335,7 +335,7 @@ class ParticleFilter(FilterEngine):
 
         ``seen`` are nodes that are seen in full in every slice.
         """
-        self._require_functions()
+        require_functions(self, _FUNCTIONS)
         scheme: Any = scheme_of(self.resampling)
         threshold = float(self.ess_threshold)
         if isinstance(scheme, Adaptive):
@@ -437,12 +437,6 @@ class ParticleFilter(FilterEngine):
         slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
         slices *= price(self)
         return enough(tried, self.tolerance, slices, self.budget, keep)
-
-    def _warn(self, filtered: FilteredParticles) -> None:
-        """At most one warning: that slices rest on one particle, or that the evidence is not known well."""
-        text = collapsed(filtered) or uncertain(filtered, self)
-        if text is not None:
-            warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
 
     def _proposals(self, slices: Slices) -> SliceProposals:
         assert not isinstance(self.proposal, str)

@@ -54,6 +54,8 @@ class FilterStep(SMCStep):
 
     #: nodes that are integrated out, of which particles hold but a draw each
     integrated: frozenset[str] = frozenset()
+    #: how many slices back answers are wanted
+    lag: int = 0
 
     def __init__(
         self,

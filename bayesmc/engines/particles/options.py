@@ -127,17 +127,6 @@ def read_functions(option: str, given: Any) -> Any:
     return MappingProxyType(functions)
 
 
-def without_functions(engine: Any, options: Collection[str]) -> dict[str, Any]:
-    """Its state as pickles carry it; ``options`` are those that hold functions by node."""
-    state = dict(engine.__dict__)
-    for option in options:
-        if isinstance(state[option], Mapping):
-            state[option] = dict.fromkeys(state[option])
-    for option in ("resampling", "auxiliary"):
-        state[option] = None if callable(state[option]) else state[option]
-    return state
-
-
 def read_by(queries: Queries, slices: Slices) -> list[str]:
     """Nodes that queries read."""
     found = []
@@ -403,6 +392,13 @@ def uncertain(filtered: FilteredParticles, engine: Any) -> str | None:
         f"be off as well ({why}); use {_more(filtered, engine)}, a "
         "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
     )
+
+
+def warn_of_errors(filtered: FilteredParticles, engine: Any) -> None:
+    """At most one warning: that slices rest on one particle, or that the evidence is not known well."""
+    text = collapsed(filtered) or uncertain(filtered, engine)
+    if text is not None:
+        warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
 
 
 def warn_of_a_lonely_step(

@@ -1,4 +1,4 @@
-"""The run of a filter over a series, and what it keeps: answers of constant size, or the particles."""
+"""What a run of a filter over a series keeps: answers of constant size, or the particles."""
 
 from __future__ import annotations
 
@@ -13,24 +13,19 @@ from bayesmc.engines.filtering import (
     Queries,
     first_slices,
     observed_answers,
-    pass_slices,
     refuse_forecast,
 )
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
-from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
-from bayesmc.engines.particles.made import Ahead, MadeSlices
-from bayesmc.engines.particles.predictive import Replicates
-from bayesmc.engines.particles.smc import Layout, Particles, quiet
+from bayesmc.engines.particles.made import MadeSlices
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
-from bayesmc.progress import Progress
-from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
@@ -73,6 +68,8 @@ class Record:
         Hold the particles, too.
     tracker : Tracker, optional
         Follows the families; without it there are errors only of slices that come with theirs.
+    names : sequence of str, optional
+        Nodes about which there are answers; all that are hidden by default.
     """
 
     def __init__(
@@ -82,9 +79,10 @@ class Record:
         queries: Queries,
         keep: bool,
         tracker: Tracker | None = None,
+        names: Sequence[str] | None = None,
     ) -> None:
         self.problem, self.layout, self.asked, self.tracker = problem, layout, queries, tracker
-        self._nodes = [problem.model[n] for n in problem.hidden]
+        self._nodes = [problem.model[n] for n in (problem.hidden if names is None else names)]
         self._waiting: list[Waiting] = []
         self._most = 1
         self._written: list[Written] = []
@@ -399,52 +397,3 @@ class FilteredParticles(SeriesPosterior):
         if self.held is None:
             raise self._not_kept(what)
         return self.held
-
-
-def filtered_by(
-    engine: Any,
-    step: FilterStep,
-    problem: SeriesProblem,
-    seed: np.random.SeedSequence,
-    keep: bool,
-    queries: Queries,
-    progress: bool | None,
-    unit: int = 0,
-    look_back: Callable[[int, Particles, Families], None] | None = None,
-) -> FilteredParticles:
-    """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
-
-    Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows.
-    """
-    record = Record(problem, step.layout, queries, keep, Tracker(step))
-    rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    looks = Replicates(problem, step.plan, check) if unit == 0 else None
-    now: Particles | None = None
-    is_ahead = step.machine is not None and look_back is None
-    ahead = Ahead(step.machine, problem, record) if is_ahead else None
-
-    def move(k: int) -> None:
-        nonlocal now
-        if ahead is not None and ahead.reaches(k, now, rng):
-            now = ahead.passed(k, looks)
-            return
-        row, old = problem.series.row(k), now
-        if looks is not None:
-            looks.look(k, old, row)
-        now = step(old, row, rng)
-        record.add(k, now, row)
-        if look_back is not None:
-            record.write()
-            assert record.families is not None
-            look_back(k, now, record.families)
-        if old is not None and not keep and look_back is None and record.is_written:
-            step.recycle(old)
-
-    def so_far(steps: int) -> FilteredParticles:
-        if ahead is not None:
-            ahead.stop(steps)
-        return record.posterior(engine, "filter", steps)
-
-    with Progress(problem.steps, engine.label, progress) as bar, quiet():
-        pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
-        return record.posterior(engine, predictive=None if looks is None else looks.found())
