@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
@@ -17,10 +18,11 @@ from bayesmc.engines.particles.errors import ByFamily, node_errors
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
+from bayesmc.engines.particles.lags import looked_back
+from bayesmc.engines.particles.options import COLLAPSED
 from bayesmc.engines.particles.smc import Bare, Particles, quiet
-from bayesmc.engines.particles.smoothing import looked_back
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.errors import LowEssWarning, QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode
 from bayesmc.randomness import Purpose, resumed, stream
 from bayesmc.results.posterior import table_variance
@@ -324,3 +326,22 @@ def absorbed(engine: Any, belief: ParticleBelief, slices: Slices, row: Row) -> P
         total if np.ndim(total) else float(total), rng.bit_generator.state,
         {n: row.inputs[n] for n in slices.template.inputs}, families, tracker, (*bare, now),
     )  # fmt: skip
+
+
+def warn_of_a_lonely_step(
+    before: Particles | None, families: Families | None, now: Particles
+) -> None:
+    """The first step that leaves little more than one particle says so; later ones know by the error."""
+    if before is not None and families is not None and np.isinf(families.settled).any():
+        return
+    worst = float(np.min(now.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(now.weights)):
+        return
+    warnings.warn(
+        f"ParticleFilter: step leaves {len(now.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {now.t}: from here on the belief cannot tell how far it is off "
+        "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
+        "looks at the observations",
+        LowEssWarning,
+        stacklevel=4,
+    )

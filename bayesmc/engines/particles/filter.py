@@ -14,12 +14,18 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_fa
 from bayesmc.engines.marginal import options as marginal
 from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
-from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound
+from bayesmc.engines.particles.belief import (
+    ParticleBelief,
+    absorbed,
+    bound,
+    warn_of_a_lonely_step,
+)
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_delay
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
-from bayesmc.engines.particles.layers import endless
+from bayesmc.engines.particles.lags import by_lag
+from bayesmc.engines.particles.layers import endless, not_backwards
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
     BUDGET,
@@ -34,21 +40,19 @@ from bayesmc.engines.particles.options import (
     described,
     enough,
     looks_told,
-    not_backwards,
     price,
     read_by,
     read_functions,
     refused,
-    warn_of_a_lonely_step,
+    require_functions,
     warn_of_errors,
     warn_of_what_is_not_guided,
+    without_functions,
 )
-from bayesmc.engines.particles.pickling import require_functions, without_functions
-from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.engines.particles.record import FilteredParticles, filtered_by
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
-from bayesmc.engines.particles.run import filtered_by
-from bayesmc.engines.particles.smoothing import Backwards, backwards, by_lag
+from bayesmc.engines.particles.smoothing import Backwards, backwards
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.randomness import seed_sequence
@@ -219,8 +223,10 @@ class ParticleFilter(FilterEngine):
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
         check_together(self)
-        object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
-        object.__setattr__(self, "delay", read_delay(self))
+        if self.marginalize is not None:
+            object.__setattr__(self, "marginalize", marginal.read_marginalize(self))
+        if self.delay is not None:
+            object.__setattr__(self, "delay", read_delay(self))
 
     def __getstate__(self) -> dict[str, Any]:
         return without_functions(self, _FUNCTIONS)

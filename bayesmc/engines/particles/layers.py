@@ -83,6 +83,15 @@ def is_bounded(plan: SlicePlan, crossing: frozenset[str]) -> bool:
     return True
 
 
+def not_backwards(name: str) -> str:
+    """Why trajectories are not drawn backwards through a node."""
+    return (
+        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
+        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
+        "engine=ParticleGibbs())"
+    )
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 

@@ -14,13 +14,17 @@ from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.marginal.options import split_of_problem
 from bayesmc.engines.particles.auxiliary import PluggedIn
-from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.optimal import guidance
 from bayesmc.engines.particles.record import FilteredParticles
-from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import LowEssWarning, ProposalWarning, UnknownNodeError, did_you_mean
+from bayesmc.errors import (
+    LowEssWarning,
+    ProposalWarning,
+    UnknownNodeError,
+    UnsupportedError,
+    did_you_mean,
+)
 from bayesmc.kernels.proposal import names_of
 from bayesmc.network import Observed
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
@@ -59,15 +63,6 @@ COLLAPSED = 2.0
 FEW = 30.0
 #: share of such slices from which on a warning says so
 MANY = 0.1
-
-
-def not_backwards(name: str) -> str:
-    """Why trajectories are not drawn backwards through a node."""
-    return (
-        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
-        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
-        "engine=ParticleGibbs())"
-    )
 
 
 def check_count(option: str, given: Any, what: str, call: str = "ParticleFilter") -> None:
@@ -125,6 +120,17 @@ def read_functions(option: str, given: Any) -> Any:
     for key, spec in functions.items():
         as_function("ParticleFilter", key, spec, FUNCTION, option)
     return MappingProxyType(functions)
+
+
+def without_functions(engine: Any, options: Collection[str]) -> dict[str, Any]:
+    """Its state as pickles carry it; ``options`` are those that hold functions by node."""
+    state = dict(engine.__dict__)
+    for option in options:
+        if isinstance(state[option], Mapping):
+            state[option] = dict.fromkeys(state[option])
+    for option in ("resampling", "auxiliary"):
+        state[option] = None if callable(state[option]) else state[option]
+    return state
 
 
 def read_by(queries: Queries, slices: Slices) -> list[str]:
@@ -401,23 +407,17 @@ def warn_of_errors(filtered: FilteredParticles, engine: Any) -> None:
         warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
 
 
-def warn_of_a_lonely_step(
-    before: Particles | None, families: Families | None, now: Particles
-) -> None:
-    """The first step that leaves little more than one particle says so; later ones know by the error."""
-    if before is not None and families is not None and np.isinf(families.settled).any():
-        return
-    worst = float(np.min(now.ess))
-    if worst >= min(COLLAPSED, 0.9 * len(now.weights)):
-        return
-    warnings.warn(
-        f"ParticleFilter: step leaves {len(now.weights)} particles that are worth {worst:.1f} equally "
-        f"weighted ones in slice {now.t}: from here on the belief cannot tell how far it is off "
-        "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
-        "looks at the observations",
-        LowEssWarning,
-        stacklevel=4,
-    )
+def require_functions(engine: Any, options: Collection[str]) -> None:
+    """Refuse an engine that came out of a pickle, and lost functions there."""
+    given = [engine.resampling, engine.auxiliary]
+    for option in options:
+        functions = getattr(engine, option)
+        given += functions.values() if isinstance(functions, Mapping) else ()
+    whole = engine.recovery is None or engine.recovery.is_whole
+    if not whole or any(value is None for value in given):
+        raise UnsupportedError(
+            "ParticleFilter: this engine was unpickled, and pickles carry no functions; make it anew"
+        )
 
 
 # ---- private ------------------------------------------------------------------------------------

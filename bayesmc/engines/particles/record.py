@@ -1,9 +1,9 @@
-"""What a run of a filter over a series keeps: answers of constant size, or the particles."""
+"""The run of a filter over a series, and what it keeps: answers of constant size, or the particles."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -13,47 +13,30 @@ from bayesmc.engines.filtering import (
     Queries,
     first_slices,
     observed_answers,
+    pass_slices,
     refuse_forecast,
 )
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
+from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
-from bayesmc.engines.particles.made import MadeSlices
-from bayesmc.engines.particles.smc import Layout, Particles
+from bayesmc.engines.particles.made import Ahead, MadeSlices
+from bayesmc.engines.particles.predictive import Replicates
+from bayesmc.engines.particles.smc import Layout, Particles, quiet
 from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
+from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
+from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
 #: slices that are written together, at most, and those that are though half as many would stay in cache
 TOGETHER, FEW = 100, 6
-
-
-class Waiting(NamedTuple):
-    """A slice that is not written yet: its families, where they are known, and values of queries."""
-
-    k: int
-    particles: Particles
-    row: Row | None
-    families: Families | None
-    values: Mapping[str, np.ndarray]
-
-
-#: arrays by node or query, slices first, by what they are
-Rows = dict[str, dict[str, np.ndarray]]
-_KINDS = ("tables", "means", "variances", "queries", "errors", "query errors", "filter")
-
-
-class Written(NamedTuple):
-    """What is kept of slices in a row; particles are those of the last, where they are not held."""
-
-    rows: Rows
-    families: list[Families]
-    particles: list[Particles]
 
 
 class Record:
@@ -144,7 +127,7 @@ class Record:
         assert self.tracker is not None and self.families is not None
         *earlier, before = self._written
         families, sums = made.followed(self.tracker, self.families, before.particles[-1])
-        rows: Rows = {what: {} for what in _KINDS} | {"filter": made.diagnosed()}
+        rows: Rows = {what: {} for what in KINDS} | {"filter": made.diagnosed()}
         for node, found in made.figures_of(self._nodes, figures(sums)):
             for what, own in zip(("means", "variances", "errors"), found, strict=True):
                 rows[what][node.name] = own.reshape(-1, *node.value_shape)
@@ -166,7 +149,7 @@ class Record:
 
     def _tallied(self) -> Written:
         """The answers about slices of which there are sums."""
-        found, rows = answers(self._tallies), Rows({what: {} for what in _KINDS})
+        found, rows = answers(self._tallies), Rows({what: {} for what in KINDS})
         for node in self._nodes:
             for what, own in zip(("means", "variances", "errors"), found[node.name], strict=True):
                 rows[what][node.name] = own.reshape(-1, *node.value_shape)
@@ -179,7 +162,7 @@ class Record:
         block = Block(self.layout, slices, room=self._room)
         families = self._followed(waiting, block)
         by = ByFamily(block, families) if families else None
-        rows: Rows = {what: {} for what in _KINDS}
+        rows: Rows = {what: {} for what in KINDS}
         for node in self._nodes:
             name = node.name
             if node.domain is not None:
@@ -397,3 +380,54 @@ class FilteredParticles(SeriesPosterior):
         if self.held is None:
             raise self._not_kept(what)
         return self.held
+
+
+def filtered_by(
+    engine: Any,
+    step: FilterStep,
+    problem: SeriesProblem,
+    seed: np.random.SeedSequence,
+    keep: bool,
+    queries: Queries,
+    progress: bool | None,
+    unit: int = 0,
+    look_back: Callable[[int, Particles, Families], None] | None = None,
+    names: Sequence[str] | None = None,
+) -> FilteredParticles:
+    """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
+
+    Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows. There are
+    answers about some nodes, or all that are hidden.
+    """
+    record = Record(problem, step.layout, queries, keep, Tracker(step), names)
+    rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
+    looks = Replicates(problem, step.plan, check) if unit == 0 else None
+    now: Particles | None = None
+    is_ahead = step.machine is not None and look_back is None
+    ahead = Ahead(step.machine, problem, record) if is_ahead else None
+
+    def move(k: int) -> None:
+        nonlocal now
+        if ahead is not None and ahead.reaches(k, now, rng):
+            now = ahead.passed(k, looks)
+            return
+        row, old = problem.series.row(k), now
+        if looks is not None:
+            looks.look(k, old, row)
+        now = step(old, row, rng)
+        record.add(k, now, row)
+        if look_back is not None:
+            record.write()
+            assert record.families is not None
+            look_back(k, now, record.families)
+        if old is not None and not keep and look_back is None and record.is_written:
+            step.recycle(old)
+
+    def so_far(steps: int) -> FilteredParticles:
+        if ahead is not None:
+            ahead.stop(steps)
+        return record.posterior(engine, "filter", steps)
+
+    with Progress(problem.steps, engine.label, progress) as bar, quiet():
+        pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
+        return record.posterior(engine, predictive=None if looks is None else looks.found())
