@@ -6,6 +6,7 @@ import sys
 
 from benchmarks import (
     bench_exact,
+    bench_fading,
     bench_gaussian,
     bench_gibbs,
     bench_marginal,
@@ -41,4 +42,6 @@ if __name__ == "__main__":
     bench_robots.main(sys.argv[1:])
     print()
     if "--short" not in sys.argv[1:]:  # many minutes
+        bench_fading.main()
+        print()
         bench_robot_logs.main()

@@ -18,6 +18,7 @@ from examples import (
     coupled_chains,
     diagnosis,
     expectation_and_marginal,
+    fading_channel,
     faithful_gibbs,
     growth_benchmark,
     ising_denoising,
@@ -48,6 +49,7 @@ FIGURES = (
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
     banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
     landmark_localization, range_only, coupled_chains, switching_target,
+    fading_channel,
 )  # fmt: skip
 
 

@@ -10,11 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import signal
 
 import bayesmc as bmc
 from bayesmc.testing import session
 from examples import (
     coupled_chains,
+    fading_channel,
     growth_benchmark,
     nile,
     stochastic_volatility,
@@ -158,6 +160,35 @@ def test_a_switching_target_is_lost_least_where_modes_are_followed() -> None:
     assert found["GPB2"][0] < 1.1 * found["1000 particles"][0]
     logs = [found[name][2] for name in ("GPB2", "IMM", "GPB1", "EKF, straight on")]
     assert logs == sorted(logs, reverse=True)
+
+
+def test_the_fading_channel_is_the_published_one() -> None:
+    """A Butterworth filter, whose gain has variance 1; the floor is that of the differential detector."""
+    moving, recursive = signal.butter(3, 0.1)
+    np.testing.assert_allclose(fading_channel.MOVING, moving, atol=1e-8)
+    np.testing.assert_allclose(fading_channel.RECURSIVE, recursive[1:], atol=1e-8)
+    own = fading_channel.channel()
+    assert 2 * own.gain @ own.start @ own.gain == pytest.approx(1.0)
+    theirs = 1e-2 * np.array([0.89409, 2.68227, 2.68227, 0.89409])  # of variance .993
+    np.testing.assert_allclose(np.sqrt(0.5) * own.gain * np.sqrt(2), theirs, rtol=5e-3)
+    assert fading_channel.floor() == pytest.approx(0.0118, abs=1e-4)
+    still = fading_channel.sent([80.0], session.scaled(2000, 8), 2)
+    wrong = (fading_channel.by_differences(still.seen) != still.bits[1:]).mean()
+    assert abs(wrong - fading_channel.floor()) < 4 * np.sqrt(2 * 0.0118 / len(still.bits))
+
+
+def test_bits_are_told_better_by_streams_and_some_symbols_late() -> None:
+    """400 bits for each noise level, thoroughly 10,000, beside the published shares.
+
+    Fades last for some symbols, and wrong bits with them: six times the variance of separate ones.
+    """
+    symbols = session.scaled(100, 25)
+    found = fading_channel.rates([10, 30], symbols, 4)
+    for k, (name, share) in enumerate((("delay 0", 0.054), ("delay 2", 0.0013))):
+        spread = np.sqrt(6 * share / (4 * symbols))
+        assert abs(found[name][k] - share) < 4 * spread, (name, found[name])
+    assert found["delay 2"].sum() <= found["delay 0"].sum() <= found["differential"].sum()
+    assert not session.is_thorough() or found["delay 2"][1] < 0.5 * found["differential"][1]
 
 
 def test_nile_is_the_published_one() -> None:

@@ -6,6 +6,7 @@ Comparisons that chance has a part in have a false-alarm rate of 1e-3 or less, a
 from __future__ import annotations
 
 import pickle
+import tracemalloc
 import warnings
 from typing import Any
 
@@ -331,3 +332,20 @@ def test_slices_that_were_done_are_answered_where_it_ends_early(
         found = stopped.value.filtered  # type: ignore[attr-defined]
     assert found.steps == 4
     assert np.array_equal(found.mean("x"), right.mean("x"))
+
+
+def test_long_series_hold_answers_alone() -> None:
+    """Bytes per slice: answers and figures are some 200, in arrays of their own 2,000."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    engine = bmc.ParticleFilter(20, delay=2)
+    bmc.filter(dbn, {"y": np.zeros(5)}, engine=engine, rng=0)
+    tracemalloc.start()
+    peaks = []
+    for steps in (200, 600):
+        tracemalloc.reset_peak()
+        bmc.filter(dbn, {"y": np.zeros(steps)}, engine=engine, rng=0)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+    tracemalloc.stop()
+    assert (peaks[1] - peaks[0]) / 400 < 500

@@ -69,6 +69,7 @@ class Record:
         self._waiting: list[Waiting] = []
         self._most = 1
         self._written: list[Written] = []
+        self._packed = 0
         self._room: dict[Any, np.ndarray] = {}
         self.keep = keep
         #: takes sums of slices as they come, or None; and what is summed and not written yet
@@ -119,6 +120,9 @@ class Record:
         earlier = self._written
         if earlier and not self.keep:
             earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
+            if len(earlier) - self._packed >= TOGETHER:  # many small arrays hold more than one
+                earlier = [*earlier[: self._packed], _packed(earlier[self._packed :])]
+                self._packed += 1
         self._written, self._waiting = [*earlier, worked_out], []
         self._tallies, self._figures, self._summed = [], [], []
 
@@ -256,9 +260,7 @@ class Record:
         return self.tracker.after(self.families, earlier, block, rows)
 
     def _joined(self, what: str, steps: int) -> dict[str, np.ndarray]:
-        names = {n: None for w in self._written for n in w.rows[what]}
-        pieces = {n: [w.rows[what][n] for w in self._written if n in w.rows[what]] for n in names}
-        return first_slices({n: np.concatenate(rows) for n, rows in pieces.items()}, steps)
+        return first_slices(_joined(self._written, what), steps)
 
 
 class FilteredParticles(SeriesPosterior):
@@ -431,3 +433,18 @@ def filtered_by(
     with Progress(problem.steps, engine.label, progress) as bar, quiet():
         pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
         return record.posterior(engine, predictive=None if looks is None else looks.found())
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
+    """Arrays of one kind, of all slices that are written."""
+    names = {n: None for w in written for n in w.rows[what]}
+    pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
+    return {n: np.concatenate(rows) for n, rows in pieces.items()}
+
+
+def _packed(written: Sequence[Written]) -> Written:
+    """Slices without their particles, as one."""
+    return Written({what: _joined(written, what) for what in KINDS}, [], [])
