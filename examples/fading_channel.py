@@ -6,8 +6,8 @@
 A receiver sees y alone. Without pilots the sign of the channel cannot be told, so bits are coded as changes
 of sign. The differential detector takes the channel to stand still for two symbols, which it does not: with
 less and less noise it gets no better. Given the bits all is linear-Gaussian, so 50 streams of bits, each with
-a Kalman filter of the channel and each bit drawn given its reading (``marginalize=``, ``proposal="optimal"``),
-follow both. A bit is told better some symbols later (``delay=``): one pass has all delays (``belief.back``).
+a Kalman filter of the channel and each bit drawn given its reading (``marginalize=``, ``proposal=``), follow
+both. A bit is told better some symbols later (``delay=``): one pass has all delays (``belief.back``).
 Beside it stands a receiver that knows the channel. Noise levels and repetitions are elements of a plate that
 are filtered apart, all in one array.
 

@@ -11,6 +11,7 @@ from tests.mutants import (
     filters,
     hamiltonian,
     lagging,
+    linearised,
     slices,
     switching,
 )
@@ -25,6 +26,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *lagging.MUTANTS,
+    *linearised.MUTANTS,
     *slices.MUTANTS,
     *densities.MUTANTS,
 )

@@ -80,23 +80,31 @@ class Followed:
         found = iter(self._program(values))
         return [made_of(result, found) for result in self.results]
 
+    @property
+    def has_slopes(self) -> bool:
+        """Whether derivatives of the means are known."""
+        return self._slopes is not None
+
     def slopes(
-        self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]
+        self,
+        values: Mapping[str, np.ndarray],
+        directions: Mapping[str, np.ndarray],
+        batch: tuple[int, ...] = (),
     ) -> list[np.ndarray] | None:
         """How the means move as what is read does.
 
         Parameters
         ----------
         values : dict
-            Without a batch.
+            With the batch, or without.
         directions : dict
-            Of each node that is read, shape (directions, *value shape).
+            Of each node that is read, shape (directions, *batch, *value shape).
 
         Returns
         -------
         list of ndarray or None
-            For each node, shape (directions, *value shape); None where a mean has no derivative that is
-            known, or jumps just there.
+            For each node, shape (directions, *batch, *value shape); None where a mean has no derivative that
+            is known, or jumps just there.
         """
         if self._slopes is None:
             return None
@@ -106,7 +114,7 @@ class Followed:
         if np.any(jumped):
             return None
         return [
-            np.broadcast_to(slope, (count, *node.value_shape))
+            np.broadcast_to(slope, (count, *batch, *node.value_shape))
             for slope, node in zip(found, self.nodes, strict=True)
         ]
 
@@ -315,32 +323,33 @@ class Level:
         ordered = [found[n] for n in part.nodes]
         return np.concatenate([m.mean for m in ordered], axis=-1), ordered
 
-    def slopes(self, mean: np.ndarray) -> np.ndarray | None:
+    def slopes(self, mean: np.ndarray, batch: tuple[int, ...] = ()) -> np.ndarray | None:
         """Derivatives of the means.
 
         Parameters
         ----------
-        mean : ndarray, shape (*lead, c)
+        mean : ndarray, shape (*batch, *lead, c)
             Where they are wanted.
 
         Returns
         -------
-        ndarray, shape (*lead, e, c), or None
+        ndarray, shape (*batch, *lead, e, c), or None
             None where a function cannot be followed, or has no derivative here.
         """
         layout, part = self.layout, self.part
         if not part.columns:
-            return np.zeros((*layout.lead, len(part.places), 0))
+            return np.zeros((*batch, *layout.lead, len(part.places), 0))
         if part.followed is None:
             return None
         points, c = self._wrapped(mean), mean.shape[-1]
-        unit = np.broadcast_to(np.eye(c).reshape(c, *(1,) * len(layout.lead), c), (c, *mean.shape))
+        ones = (1,) * (len(batch) + len(layout.lead))
+        unit = np.broadcast_to(np.eye(c).reshape(c, *ones, c), (c, *mean.shape))
         values, moves = dict(self.known), {}
         for name, place in part.columns.items():
             node = layout.model[name]
             values[name] = layout.unpacked(node, points[..., place])
             moves[name] = layout.unpacked(node, unit[..., place])
-        found = part.followed.slopes(values, moves)
+        found = part.followed.slopes(values, moves, batch)
         if found is None:
             return None
         packed = [layout.packed(n, s) for n, s in zip(part.followed.nodes, found, strict=True)]

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.kalman.covariances import full_factor, without_absent
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.means import absorbed
@@ -75,8 +76,10 @@ class Gaussians(NamedTuple):
         return self.factors if self.which is None else self.factors.take(self.which, axis=0)
 
     def has(self, name: str) -> bool:
-        """Whether there is a belief about a node."""
-        return name in self.layout.rows
+        """Whether there is a belief about a node; of angles that are missing there are draws alone."""
+        layout = self.layout
+        known = name in layout.rows
+        return known and (layout.angles is None or not layout.angles_of(name).any())
 
     def joined(self, parties: Sequence[Any], at: np.ndarray) -> Gaussians:
         """Some of those of several parties, one after the other."""
@@ -119,7 +122,10 @@ class Gaussians(NamedTuple):
         layout, found = self.layout, {}
         drawn = self.drawn(rng) if layout.n else self.mean
         for name, place in layout.rows.items():
-            found[name] = layout.unpacked(layout.model[name], drawn[..., place])
+            node = layout.model[name]
+            found[name] = layout.unpacked(node, drawn[..., place])
+            if node.angles is not None:
+                found[name] = np.where(node.angles, wrap_angle(found[name]), found[name])
             found[name].flags.writeable = False
         return found
 
@@ -261,8 +267,9 @@ def take_in(
         certain = None if made.certain is None else made.certain.take(group, axis=0)
         root, gain = made.root.take(group, axis=0), made.gain.take(group, axis=0)
         own = Conditioned(root, gain, made.factor, None, certain)
+    angles = None if layout.angles is None else layout.angles[pattern.observed]
     terms = _sizes(before.mean, offset, moves, found.kind)
-    after, eta, log = absorbed(layout, pattern, own, mean, row, given, terms=terms)
+    after, eta, log = absorbed(layout, pattern, own, mean, row, given, angles, terms)
     factors = full_factor(layout, pattern, made.factor)
     count = moves.shape[1]
     log = np.broadcast_to(log, (n, count, *layout.lead))

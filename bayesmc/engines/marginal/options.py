@@ -14,6 +14,8 @@ from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
 _SEEN = "observed, weights the particles by its predictive density"
+#: said of nodes whose means are not affine
+_BENT = "linearised at each particle's own mean"
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
 
@@ -147,4 +149,15 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
             engine.proposal == "optimal" and name in slices.stochastic and name not in problem.seen
         ):
             found[name] = "sampled given the slice before and the row"
+    for name in split.linearised:
+        found[name] += f"; {_BENT}"
     return found
+
+
+def effort_told(engine: Any, problem: SeriesProblem) -> str:
+    """What a slice takes, and what of it is an approximation, where something is integrated out."""
+    split, each = split_of_problem(engine, problem), "a Kalman filter for each particle"
+    if split is None or not split.linearised:
+        return each
+    names = ", ".join(repr(n) for n in problem.slices.dynamic if n in split.linearised)
+    return f"{each}; the log marginal likelihood is an approximation of unknown error ({names} linearised)"

@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS
 from bayesmc.engines.kalman.reading import Linear, composed
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.engines.marginal.gaussians import Coefficients
+from bayesmc.engines.marginal.gaussians import Coefficients, Gaussians
 
 #: joint states of finite nodes up to which they are told apart by a table
 _STATES = 4096
@@ -92,6 +92,10 @@ class SliceReader:
         self.hidden_before = frozenset(n + PREVIOUS for n in layout.before)
         self._kept: dict[int, int] = {}
         self._made: Linear | None = None
+
+    def at(self, before: Gaussians) -> SliceReader:
+        """A reader for particles with these beliefs about the slice before."""
+        return self
 
     def kinds(self, values: Values, names: Sequence[str]) -> Kinds | None:
         """Particles by what they have of some nodes; None where any of these is not finite."""

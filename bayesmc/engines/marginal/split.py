@@ -3,7 +3,8 @@
 What is integrated out is linear-Gaussian given everything else: means affine in each other and in their
 values of the slice before, scales free of them, coefficients any function of sampled nodes, of what is seen,
 of inputs and of time. Nothing that is sampled depends on it. Where a density breaks this, as few numbers as
-possible are sampled instead, with whatever they depend on.
+possible are sampled instead, with whatever they depend on. Of nodes that are named means may be bent
+(``linearised``).
 """
 
 from __future__ import annotations
@@ -17,10 +18,13 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.kalman.reading import why_not_placed
 from bayesmc.engines.kalman.slices import Layout, always_unknown
+from bayesmc.engines.marginal.linearised import why_not_bent
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError, did_you_mean
 
 AUTO = "auto"
+#: why some numbers are not integrated out, but where they are measured and missing
+_ANGLE = "is an angle"
 
 
 @dataclass(frozen=True)
@@ -37,12 +41,15 @@ class Split:
         Nodes seen that depend on these.
     why : dict
         Hidden number that is sampled -> why it is not integrated out.
+    linearised : dict
+        Node whose mean is made linear at each particle's own mean -> why it must be.
     """
 
     seen: frozenset[str]
     inner: tuple[str, ...]
     below: frozenset[str]
     why: Mapping[str, str] = field(default_factory=dict, hash=False)
+    linearised: Mapping[str, str] = field(default_factory=dict, hash=False)
 
 
 def split_of(
@@ -126,6 +133,8 @@ class _Search:
             for n, v in model.probe.items()
         } | dict(static)
         self.why: dict[str, str] = {}
+        #: nodes that are made linear, once it is asked for by name
+        self.bent: dict[str, str] | None = None
 
     def found(self) -> Split:
         inner = set(self.hidden)
@@ -157,7 +166,8 @@ class _Search:
         read = {p for model in self.models for n in self.slices.dynamic for p in model[n].parents}
         read = {p.removesuffix(PREVIOUS) for p in read}
         for name in self.hidden:  # what is measured of them, where it is missing
-            if name not in read and self._never(name) is None and self._above((name,), inner):
+            fits = self._never(name) in (None, _ANGLE)
+            if name not in read and fits and self._above((name,), inner):
                 inner.add(name)
         for name in self.hidden:
             above = [] if name in inner else sorted(self._above((name,), inner))
@@ -166,6 +176,7 @@ class _Search:
                     f"marginalize= names {above[0]!r}, on which {name!r} depends, which is sampled; name "
                     f"{name!r}, too, or leave {above[0]!r} out"
                 )
+        self.bent = {}
         fault = self._fault(inner)
         if fault is not None:
             name, reason = fault
@@ -181,7 +192,8 @@ class _Search:
     def _split(self, inner: Collection[str], why: Mapping[str, str]) -> Split:
         order = tuple(n for n in self.slices.dynamic if n in inner)
         below = frozenset(n for n in self.seen if self._above((n,), inner))
-        return Split(self.seen, order, below, {n: w for n, w in why.items() if self._is_number(n)})
+        numbers = {n: w for n, w in why.items() if self._is_number(n)}
+        return Split(self.seen, order, below, numbers, self.bent or {})
 
     def _is_number(self, name: str) -> bool:
         node = self.slices.later[name]
@@ -196,7 +208,7 @@ class _Search:
             if node.is_discrete:
                 return "takes whole numbers"
             if node.angles is not None:
-                return "is an angle"
+                return _ANGLE
         return None
 
     def _above(self, names: Iterable[str], inner: Collection[str]) -> set[str]:
@@ -278,4 +290,11 @@ class _Search:
             return None
         hidden = layout.unknown | {n + PREVIOUS for n in layout.before}
         values = {n: v for n, v in self.values.items() if n not in hidden}
-        return why_not_placed(layout, name, values)
+        reason = why_not_placed(layout, name, values)
+        if reason is None or self.bent is None:
+            return reason
+        why = why_not_bent(layout, name, values)
+        if why is None:
+            self.bent[name] = reason
+            return None
+        return f"{reason}; it cannot be made linear, either: it {why}"

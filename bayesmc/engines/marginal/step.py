@@ -24,6 +24,7 @@ from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.marginal.choices import Choices
 from bayesmc.engines.marginal.gaussians import Coefficients, Gaussians, Taken, nothing, take_in
 from bayesmc.engines.marginal.lagging import newest, told_more
+from bayesmc.engines.marginal.linearised import LinearisedReader
 from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split, blocks_of
@@ -148,7 +149,7 @@ class MarginalStep(FilterStep):
         known = self._values(place, row, before, values, selection)
         if place.choices is None:
             pattern, target, given = seen_of(place.layout, row)
-            coefficients = place.reader.read(known)
+            coefficients = place.reader.at(inner).read(known)
             made = take_in(place.layout, pattern, inner, coefficients, target, given, self.lag > 0)
             own = made.log[:, 0]
             if self.blocks:
@@ -185,7 +186,7 @@ class MarginalStep(FilterStep):
     ) -> tuple[np.ndarray, Taken, Coefficients]:
         """The row taken in with every choice of finite nodes; logs have shape (particles, choices, *lead)."""
         pattern, target, given = seen_of(place.layout, row)
-        prior, coefficients = choices.read(known, row, place.reader)
+        prior, coefficients = choices.read(known, row, place.reader.at(inner))
         made = take_in(place.layout, pattern, inner, coefficients, target, given)
         return prior + made.log, made, coefficients
 
@@ -255,7 +256,9 @@ class MarginalStep(FilterStep):
             steps: list[Step] | None = [] if choices is not None else None
             if choices is None and not partly:
                 steps = self.sampling.steps_without(row, _left_out(layout))
-            self._places[key] = Place(layout, SliceReader(layout), steps, choices)
+            bent = any(n in self.split.linearised for n in layout.placed)
+            reader = LinearisedReader(layout) if bent else SliceReader(layout)
+            self._places[key] = Place(layout, reader, steps, choices)
         return self._places[key]
 
 

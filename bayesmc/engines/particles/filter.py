@@ -107,25 +107,24 @@ class ParticleFilter(FilterEngine):
         Node -> density to draw it from then, given observed nodes, inputs or ``t``; all nodes that the next
         slice reads. The slice is weighted as if that density were the model's, so its answers and the
         evidence are biased; ``rejuvenated`` of the result says which slices.
-
     adapt : KLD, optional
         How many particles a slice needs, at most ``particles``: many where the belief is wide, few where it
         is narrow. Particles are then resampled whenever their number changes.
     recovery : Recovery, optional
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
-
     marginalize : "auto", sequence of str, or None
         Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
         given the sampled ones, each particle with a Kalman filter of its own, all in one array operation, and
-        weighted by the density of the row given these. ``"auto"``: all that can be, names: those, None: none.
-        ``explain`` says which, and why not more. With ``proposal="optimal"`` finite sampled nodes are drawn
-        given the row (the mixture Kalman filter). ``particles`` of such nodes are a draw from each filter.
+        weighted by the density of the row given these. ``"auto"``: all that can be, names: those; ``explain``
+        says which. Means of named ones need not be affine: they are made linear at each particle's own mean
+        (extended Kalman filters), so answers and evidence are approximations of unknown error then. With
+        ``proposal="optimal"`` finite sampled nodes are drawn given the row (the mixture Kalman filter).
+        ``particles`` of such nodes are a draw from each filter.
     delay : int, optional
         How many rows answers look ahead: those for slice t are given the rows up to t + delay (at the end
         what there is), by the weights of slice t + delay on the ancestors in t; beliefs about what is
         integrated out take these rows in, too. Ancestors are few where the delay is long. Beliefs of ``step``
         answer as late (``about``, ``back``).
-
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
     compiled : bool, optional
@@ -265,8 +264,9 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
-        each = "a Kalman filter for each particle"
-        return each if step.integrated else told(step, problem, self.compiled)
+        if step.integrated:
+            return marginal.effort_told(self, problem)
+        return told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
         found = self.effort(problem) if asked.what == "filter" else ""

@@ -1,0 +1,157 @@
+"""Named nodes whose means are not affine: made linear at each particle's own mean.
+
+As the extended Kalman filter does, level by level of the slice: what reads the slice before is made linear at
+what is believed of that, what reads this slice at what is expected of it. Derivatives are those of the
+declared functions' expressions, of all particles in one call. What comes of it is an approximation, the
+evidence included. Scales that depend on what is integrated out have no place in it, nor have other families.
+
+References
+----------
+Doucet, de Freitas, Murphy and Russell (2000), UAI 16, sec. 4 (extended Kalman filters in particles); Särkkä
+and Svensson (2023), Bayesian Filtering and Smoothing, 2nd ed., ch. 7; Thrun, Burgard and Fox (2005),
+Probabilistic Robotics, sec. 13.3 (FastSLAM's landmarks).
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS
+from bayesmc.distributions import MvNormal, Normal, VonMises, WrappedNormal
+from bayesmc.engines.kalman.levels import Followed, Level, Part, Plan
+from bayesmc.engines.kalman.reading import Linear
+from bayesmc.engines.kalman.slices import Layout, put_noise
+from bayesmc.engines.marginal.gaussians import Coefficients, Gaussians
+from bayesmc.engines.marginal.reading import Kinds, SliceReader, Values
+from bayesmc.errors import TraceError
+from bayesmc.expression import Family, expressions_of
+from bayesmc.network.expressions import Opaque, density
+
+#: balances the rounding of a central difference against its curvature
+_STEP = float(np.finfo(float).eps ** (1 / 3))
+#: families whose location may be bent, and those of angles, which may be seen only
+_FAMILIES, _CIRCULAR = (Normal, MvNormal), (VonMises, WrappedNormal)
+
+
+def why_not_bent(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> str | None:
+    """Why a node cannot be made linear in what is unknown, to follow its name; or None.
+
+    Parameters
+    ----------
+    values : dict
+        What is known of the slice, and of the one before.
+    """
+    model, node = layout.model, layout.model[name]
+    if node.is_discrete or node.domain is not None or len(node.event_shape) > 1:
+        return "is no number or vector"
+    hidden = {n + PREVIOUS for n in layout.before}.union(layout.drawn)
+    known = [n for n in (*values, *layout.computed) if n in model.nodes]
+    cut = frozenset(n for n in (*hidden, *known) if model[n].kind == "deterministic")
+    found = density(model, name, cut)
+    if isinstance(found, Opaque):
+        return f"cannot be followed ({found.reason})"
+    result, above = found.result, hidden & found.leaves
+    if node.is_stochastic and above:
+        if not isinstance(result, Family) or result.make not in (*_FAMILIES, *_CIRCULAR):
+            return "depends on what is integrated out and is not Normal or MvNormal"
+        for key, value in result.parameters.items():
+            bent = set().union(*(e.leaves for e in expressions_of(value))) & hidden
+            if key != "loc" and bent:
+                return f"has a {key} that depends on {', '.join(map(repr, sorted(bent)))}"
+    try:
+        if not Followed(model, [name], sorted(above), known).has_slopes:
+            return "has no derivative that is known"
+    except TraceError as error:
+        return f"cannot be followed ({error})"
+    return None
+
+
+class LinearisedReader(SliceReader):
+    """Reads the coefficients of slices of one layout off their tangents at a belief.
+
+    Parameters
+    ----------
+    layout : Layout
+    """
+
+    before: Gaussians
+
+    def __init__(self, layout: Layout) -> None:
+        super().__init__(layout)
+        self._plans: list[Plan] = []
+
+    def at(self, before: Gaussians) -> LinearisedReader:
+        found = copy.copy(self)
+        found.before = before
+        return found
+
+    def kinds(self, values: Values, names: object) -> Kinds | None:
+        """Every particle by itself: none has another's mean."""
+        return None
+
+    def read(self, values: Values) -> Coefficients:
+        made = self._made_linear(values.at(None), self.before.mean)
+        return Coefficients(made.offset[:, None], made.moves[:, None], made.noise[:, None], None)
+
+    def read_choices(self, values: Mapping[str, np.ndarray], kinds: int, choices: int) -> Linear:
+        made = self._made_linear(dict(values), self.before.mean.repeat(choices, axis=0))
+        return Linear(*(a.reshape(kinds, choices, *a.shape[1:]) for a in made))
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _made_linear(self, values: dict[str, np.ndarray], mean: np.ndarray) -> Linear:
+        """Tangents at means, shape ``(batch, *lead, n_prev)``."""
+        layout = self.layout
+        for name in layout.computed:
+            values[name] = layout.model.evaluate(name, values)[0]
+        if not self._plans:
+            self._plans.append(Plan(layout, values))
+        n, total = layout.n_prev, layout.n_prev + layout.p + layout.n
+        shape = mean.shape[:-1]
+        centre, rows = np.zeros((*shape, total)), np.zeros((*shape, total, n))
+        centre[..., :n] = mean
+        rows[..., np.arange(n), np.arange(n)] = 1.0
+        for part in self._plans[0].levels:
+            level = _Batch(layout, part, values)
+            found, slopes, fresh = level.tangents(centre[..., part.reads])
+            wider = np.zeros((*shape, total, fresh.shape[-1]))
+            rows = np.concatenate([rows, wider], axis=-1)
+            own = slopes @ rows[..., part.reads, :]
+            own[..., own.shape[-1] - fresh.shape[-1] :] += fresh
+            centre[..., part.places], rows[..., part.places, :] = found, own
+        moves = rows[..., n:, :n]
+        return Linear(centre[..., n:] - np.matvec(moves, mean), moves, rows[..., n:, n:])
+
+
+class _Batch(Level):
+    """The nodes of a level, of all particles at once."""
+
+    part: Part
+
+    def tangents(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Values at means, shape ``(batch, *lead, c)``, derivatives there, and rows of the nodes' noise."""
+        found, moments = self(mean)
+        slopes = self.slopes(mean, mean.shape[:1])
+        if slopes is None:
+            slopes = self._differences(mean)
+        count = found.shape[-1]
+        fresh, at = np.zeros((*found.shape, count)), 0
+        for name, own in zip(self.part.nodes, moments, strict=True):
+            place = slice(at, at + self.layout.size(name))
+            if own.scale is not None:
+                put_noise(fresh[..., place, place], own.scale)
+            at = place.stop
+        return found, slopes, fresh
+
+    def _differences(self, mean: np.ndarray) -> np.ndarray:
+        """Central differences, where a function has no derivative just there."""
+        steps = 2.0 ** np.round(np.log2(_STEP * np.maximum(np.abs(mean), self.part.sizes)))
+        columns = []
+        for j in range(mean.shape[-1]):
+            move = steps * (np.arange(mean.shape[-1]) == j)
+            off = self.off(self(mean + move)[0], self(mean - move)[0])
+            columns.append(off / (2 * steps[..., j, None]))
+        return np.stack(columns, axis=-1)
