@@ -153,7 +153,7 @@ def report(snrs: Sequence[float], found: dict[str, np.ndarray], symbols: int) ->
     print(f"{'no noise':>9}{floor():15.5f}")
 
 
-def draw(snrs: Sequence[float], found: dict[str, np.ndarray], stretch: int = 150) -> Any:
+def draw(snrs: Sequence[float], found: dict[str, np.ndarray], stretch: int) -> Any:
     """Wrong bits against noise; a stretch of the channel, and what is believed of it."""
     own = sent([20.0], stretch)
     rows = {"seen_real": own.seen.real, "seen_imaginary": own.seen.imag}
@@ -187,10 +187,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table, and draw it."""
     options = picture.options(__doc__, arguments)
     snrs = SNRS[::2] if options.fast else SNRS
-    symbols = 100 if options.fast else SYMBOLS
+    symbols, stretch = (50, 40) if options.fast else (SYMBOLS, 150)
     found = rates(snrs, symbols)
     report(snrs, found, symbols)
-    picture.save(draw(snrs, found), options.out, "fading_channel")
+    picture.save(draw(snrs, found, stretch), options.out, "fading_channel")
 
 
 if __name__ == "__main__":

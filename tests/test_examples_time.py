@@ -178,11 +178,11 @@ def test_the_fading_channel_is_the_published_one() -> None:
 
 
 def test_bits_are_told_better_by_streams_and_some_symbols_late() -> None:
-    """400 bits for each noise level, thoroughly 10,000, beside the published shares.
+    """240 bits for each noise level, thoroughly 10,000, beside the published shares.
 
     Fades last for some symbols, and wrong bits with them: six times the variance of separate ones.
     """
-    symbols = session.scaled(100, 25)
+    symbols = session.scaled(60, 40)
     found = fading_channel.rates([10, 30], symbols, 4)
     for k, (name, share) in enumerate((("delay 0", 0.054), ("delay 2", 0.0013))):
         spread = np.sqrt(6 * share / (4 * symbols))

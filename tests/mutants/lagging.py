@@ -32,10 +32,10 @@ def late(seed: int) -> Verdict:
         ratio = np.exp(found.log_marginal_likelihood - right.log_marginal_likelihood)
         return {name: ratio * figure for name, figure in figures(found, 1).items()}
 
-    return repeated_test(estimate, figures(right, 1), replications=60, alpha=ALPHA, rng=seed)
+    return repeated_test(estimate, figures(right, 1), replications=30, alpha=ALPHA, rng=seed)
 
 
-BY = "repeated_test, 60 runs of 300 particles"
+BY = "repeated_test, 30 runs of 300 particles"
 MUTANTS = [
     Mutant(
         "delayed answers have the weights of their own rows",
