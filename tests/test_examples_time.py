@@ -187,8 +187,9 @@ def test_bits_are_told_better_by_streams_and_some_symbols_late() -> None:
     for k, (name, share) in enumerate((("delay 0", 0.054), ("delay 2", 0.0013))):
         spread = np.sqrt(6 * share / (4 * symbols))
         assert abs(found[name][k] - share) < 4 * spread, (name, found[name])
-    assert found["delay 2"].sum() <= found["delay 0"].sum() <= found["differential"].sum()
-    assert not session.is_thorough() or found["delay 2"][1] < 0.5 * found["differential"][1]
+    if session.is_thorough():
+        assert found["delay 2"].sum() < found["delay 0"].sum() < found["differential"].sum()
+        assert found["delay 2"][1] < 0.5 * found["differential"][1]
 
 
 def test_nile_is_the_published_one() -> None:

@@ -191,6 +191,15 @@ def test_errors_are_those_that_runs_have(options: dict[str, Any]) -> None:
     )  # fmt: skip
 
 
+def test_shares_that_few_ancestors_have_are_not_told_as_if_they_had_many() -> None:
+    """A regime that next to no ancestor has: errors beyond six stated ones are none by chance."""
+    right = exact(switching(), up_to(ROWS, 4)).mean("s")[2]
+    engine = bmc.ParticleFilter(500, delay=2)
+    for seed in range(session.scaled(30, 8)):
+        found = bmc.filter(switching(), ROWS, engine=engine, rng=seed)
+        assert abs(found.mean("s")[2] - right) < 6 * found.mcse("s")[2], seed
+
+
 # ---- one row after the other --------------------------------------------------------------------
 
 

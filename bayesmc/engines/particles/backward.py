@@ -43,6 +43,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Series, Slices
+from bayesmc.engines.particles.families import ancestors_worth
 from bayesmc.engines.particles.layers import LOCATION, Layer, is_bounded, layers_of
 from bayesmc.engines.particles.smc import Layout, Particles, along_plates, evenly_weighted
 from bayesmc.engines.slice_steps import SlicePlan, size_of
@@ -315,6 +316,7 @@ def lagged(filtered: Sequence[Particles], layout: Layout, slices: Slices) -> Par
     """What the last of some slices in a row says of the first: ancestors of its particles, with its weights.
 
     A particle that was drawn anew has no ancestors. Where that happened, the last slice before it speaks.
+    Those that share ancestors are worth no more than these.
     """
     shape = (layout.particles, *layout.lead)
     own = np.arange(shape[0]).reshape((-1,) + (1,) * len(layout.lead))
@@ -328,10 +330,11 @@ def lagged(filtered: Sequence[Particles], layout: Layout, slices: Slices) -> Par
         if anew.any():
             spoken = _either(anew, before, spoken)
             index = None if index is None else np.where(anew, own, index)
-    values = filtered[0].values
+    values, ess = filtered[0].values, spoken.ess
     if index is not None:
         values = _taken(values, index, slices, layout.apart)
-    return spoken._replace(t=filtered[0].t, values=values)
+        ess = ancestors_worth(index, spoken)
+    return spoken._replace(t=filtered[0].t, values=values, ess=ess)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -148,7 +148,7 @@ class ParticleBelief(OnlineBelief):
 
     @property
     def weight_ess(self) -> Any:
-        ess = self._particles.ess
+        ess = self._particles.ess if self.now is None else self.now.ess
         return ess if np.ndim(ess) else float(ess)
 
     @property

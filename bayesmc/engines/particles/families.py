@@ -5,9 +5,12 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from bayesmc.engines.particles.smc import Particles
 
 #: slices after which the younger origin takes over at the latest
 LONGEST = 50
@@ -121,3 +124,12 @@ class Families(NamedTuple):
     scouts: Scouts | None = None
     drift: Drift | None = None
     doubted: Any = -LONGEST
+
+
+def ancestors_worth(index: np.ndarray, now: Particles) -> Any:
+    """Equally weighted ancestors that those of particles are worth, shape (*apart)."""
+    n, many = len(index), math.prod(index.shape[1:])
+    rows = index.reshape(n, many) + n * np.arange(many)
+    shares = np.bincount(rows.reshape(-1), (now.weights / now.total).reshape(-1), n * many)
+    found = 1.0 / np.square(shares.reshape(many, n)).sum(axis=1)
+    return found.reshape(index.shape[1:]) if index.ndim > 1 else float(found[0])
