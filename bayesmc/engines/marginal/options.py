@@ -131,11 +131,13 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
 
 def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
     """What is done to each node, given what plain particles do to it."""
-    split = split_of_problem(engine, problem)
-    found = dict(treated)
-    if split is None:
+    found, slices = dict(treated), problem.slices
+    if engine.marginalize is None:
         return found
-    slices = problem.slices
+    known = frozenset(n for n in slices.stochastic if n in problem.seen)
+    split = split_of(slices, known, engine.marginalize, problem.known_static)
+    if not split.inner:
+        return found | {n: f"{found[n]}; not integrated out: {w}" for n, w in split.why.items()}
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
         each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"

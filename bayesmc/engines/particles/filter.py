@@ -258,9 +258,9 @@ class ParticleFilter(FilterEngine):
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
-        if self._integrates(problem):
-            return marginal.told(self, problem, found)
-        return found | looks_told(self, problem, found)
+        if not self._integrates(problem):
+            found |= looks_told(self, problem, found)
+        return marginal.told(self, problem, found)
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
