@@ -106,8 +106,11 @@ class Gaussians(NamedTuple):
 
     def completed(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Values of all nodes with a belief, one draw for each particle."""
+        return self.values_of(self.drawn(rng) if self.layout.n else self.mean)
+
+    def values_of(self, drawn: np.ndarray) -> dict[str, np.ndarray]:
+        """Draws of all numbers, shape (particles, *lead, n), by node."""
         layout, found = self.layout, {}
-        drawn = self.drawn(rng) if layout.n else self.mean
         for name, place in layout.rows.items():
             found[name] = layout.unpacked(layout.model[name], drawn[..., place])
             found[name].flags.writeable = False
