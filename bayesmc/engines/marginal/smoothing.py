@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.categorical import pick
-from bayesmc.dbn import PREVIOUS, Series
+from bayesmc.dbn import PREVIOUS, Series, Slices
 from bayesmc.engines.marginal.gaussians import Gaussians, nothing, take_in
 from bayesmc.engines.marginal.messages import (
     Message,
@@ -43,10 +43,11 @@ from bayesmc.engines.marginal.messages import (
     sizes_of,
 )
 from bayesmc.engines.marginal.reading import Values
-from bayesmc.engines.marginal.split import layouts_of
+from bayesmc.engines.marginal.split import Split, layouts_of
 from bayesmc.engines.marginal.step import seen_of
-from bayesmc.engines.particles.layers import layers_of
+from bayesmc.engines.particles.layers import carried_on
 from bayesmc.engines.particles.smc import Layout, Particles, evenly_weighted
+from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.network.forward import Compute, Pass, Step, WeighDrawn
 from bayesmc.resampling import systematic
 
@@ -133,12 +134,12 @@ class MarginalBackward:
         return found
 
 
-def why_not_backwards(step: Any) -> str | None:
+def why_not_backwards(slices: Slices, split: Split) -> str | None:
     """Why paths cannot be drawn backwards with the rest integrated out, or None."""
-    if step.layout.apart:
-        return f"elements of plate {step.layout.apart[0]!r} are filtered separately"
-    layout = layouts_of(step.slices, step.split.inner, ())[1]
-    carried = layers_of(step.plan, step.split.seen)[0].carried - layout.unknown
+    apart = plates_apart(slices)
+    if apart:
+        return f"elements of plate {apart[0]!r} are filtered separately"
+    carried = carried_on(slices, split.seen) - layouts_of(slices, split.inner, ())[1].unknown
     if carried:
         return f"{min(carried)!r} is computed from sampled nodes of the slice before, and read by the next"
     return None

@@ -19,7 +19,6 @@ from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
-from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
     BUDGET,
@@ -248,9 +247,9 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if asked.what == "fixed-lag" and self._integrates(problem):
+        if asked.what == "fixed-lag" and self._integrates(problem) and plates_apart(problem.slices):
             return marginal.NOT_LAGGED
-        sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
+        sums = marginal.endless_sums(self, problem) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
@@ -268,7 +267,7 @@ class ParticleFilter(FilterEngine):
         return filters if step.integrated else told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
-        return self.effort(problem) if asked.what == "filter" else ""
+        return self.effort(problem) if asked.what == "filter" else marginal.back(self, problem, asked)
 
     def filter(
         self,
