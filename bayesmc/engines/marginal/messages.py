@@ -108,9 +108,7 @@ def pulled(
     root = np.matrix_transpose(np.linalg.qr(np.matrix_transpose(own), mode="r"))
     diagonal = root.diagonal(0, -2, -1)
     root = root * np.where(diagonal < 0, -1.0, 1.0)[..., None, :]
-    inverse = np.matrix_transpose(
-        solve_lower(root[..., None, :, :], np.eye(root.shape[-1]))
-    )
+    inverse = np.matrix_transpose(solve_lower(root[..., None, :, :], np.eye(root.shape[-1])))
     basis, short = np.linalg.qr(inverse @ whole)
     offset = found.offset[:, 0]
     off = np.concatenate(
