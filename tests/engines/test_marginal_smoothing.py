@@ -388,7 +388,7 @@ FAULTS = {
         "switching", Edit(SMOOTHING + "_Paths.log_after", "found + log, which", "found + 0.0 * log, which")
     ),
     "beliefs are those of the filter": (
-        "switching", Edit(SMOOTHING + "_Paths.believed", "combined(messages[k], inner)", "inner")
+        "switching", Edit(SMOOTHING + "_Paths.believed", "combined(messages[k], filtered)", "filtered")
     ),
     "constants that depend on the particle are lost": (
         "by the last regime", Edit(SMOOTHING + "_Paths.log_after", "own + log_evidence(", "log_evidence(")

@@ -1,7 +1,7 @@
 """``ParticleFilter(marginalize=)``: the evidence has no bias, and faults that give it one are seen.
 
-On random switching templates that can be enumerated the mean of exp(log Z_hat - log Z) is 1 within four standard
-errors, a false alarm in some 16,000 templates; 2,000 runs of each in a thorough session.
+On random switching templates that can be enumerated the mean of exp(log Z_hat - log Z) is 1 within four
+standard errors, a false alarm in some 16,000 templates; 2,000 runs of each in a thorough session.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def templates(count: int) -> list[tuple[int, Any, float]]:
 
 
 def ratios(case: Any, log: float, proposal: str | None, runs: int) -> np.ndarray:
-    """Estimated over exact evidence, run by run: of the filter's steps alone, which cost a tenth of it all."""
+    """Estimated over exact evidence, run by run: of the filter's steps alone, which cost less."""
     engine = bmc.ParticleFilter(30, marginalize="auto", proposal=proposal)
     problem = pose_series(case.dbn, case.observations, case.inputs or None)
     step = engine.step_of(problem.slices, problem.known_static, seen=problem.seen)

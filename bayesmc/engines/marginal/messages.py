@@ -101,7 +101,8 @@ def pulled(
     look = after.look.take(of_look, axis=0)
     moves, noise = found.moves[of_slice, 0], found.noise[of_slice, 0]
     told = moves[..., pattern.observed, :]
-    own = _noise_of(pattern, look, noise, places, np.abs(told) @ sizes[..., None])
+    terms = np.abs(told) @ sizes[..., None] + np.abs(row)[..., None]
+    own = _noise_of(pattern, look, noise, places, terms)
     whole = np.concatenate([told, look @ moves[..., places, :]], axis=-2)
     if pattern.absent is not None:
         whole[..., : len(pattern.observed), :][..., pattern.absent, :] = 0.0

@@ -120,14 +120,16 @@ class MarginalBackward:
             rows = np.arange(low, min(low + step, count))
             if everyone:
                 which = np.broadcast_to(np.arange(tried), (len(rows), tried))
-                own = paths.filtered[k].log_weights
+                otherwise = own = paths.filtered[k].log_weights
             else:
                 some = pick(weights, rng.random(len(rows) * _TRIED)).reshape(-1, _TRIED)
                 which = np.concatenate([parents[rows, None], some], axis=1)
-                own = np.zeros(tried)
+                own, otherwise = np.zeros(tried), np.where(np.arange(tried) == 0, 0.0, -np.inf)
             log = own + paths.log_after(k, which, rows, values, message)
             top = log.max(axis=1, keepdims=True)
-            log = np.where(top > -np.inf, log - top, own - own.max())  # the filter's word
+            log = np.where(
+                top > -np.inf, log - top, otherwise - otherwise.max()
+            )  # the filter's word
             shares = np.exp(log).cumsum(axis=1)
             at = (shares <= rng.random((len(rows), 1)) * shares[:, -1:]).sum(axis=1)
             found[rows] = np.take_along_axis(which, np.minimum(at, tried - 1)[:, None], 1)[:, 0]
@@ -274,27 +276,30 @@ class _Paths:
         """Smoothed beliefs given each path, and one draw of them for all slices."""
         count, found = len(messages[0].target), []
         layout = Layout(count, (), ())
-        inner: Gaussians | None = None
-        known_before: Gaussians | None = None
+        filtered: Gaussians | None = None
+        joint: Gaussians | None = None
         for k, values in enumerate(drawn):
             row, place = self.series.row(self.first + k), self._place(k)
-            before = drawn[k - 1] if k else {}
-            own = self._values(place, row, before, values, count)
+            own = self._values(place, row, drawn[k - 1] if k else {}, values, count)
             pattern, target, given = seen_of(place.layout, row)
             coefficients = place.reader.read(own)
-
-            def after(
-                prior: Gaussians | None,
-                to: Any = (place.layout, pattern),
-                of: Any = (coefficients, target, given),
-            ) -> Gaussians:
-                start = nothing(to[0], count) if prior is None else prior.carried()
-                return take_in(*to, start, *of).chosen(None)
-
-            inner = after(inner)
-            smoothed = combined(messages[k], inner)
-            sample = combined(messages[k], after(known_before)).drawn(rng)
-            known_before = _point(smoothed, sample)
+            start = nothing(place.layout, count)
+            filtered, alone = (
+                take_in(
+                    place.layout,
+                    pattern,
+                    start if before is None else before.carried(),
+                    coefficients,
+                    target,
+                    given,
+                ).chosen(None)
+                for before in (filtered, joint)
+            )
+            smoothed, sample = (
+                combined(messages[k], filtered),
+                combined(messages[k], alone).drawn(rng),
+            )
+            joint = _point(smoothed, sample)
             whole = {**values, **smoothed.values_of(sample)}
             made = evenly_weighted(self.filtered[k].t, whole, layout)
             found.append(made._replace(inner=smoothed))
