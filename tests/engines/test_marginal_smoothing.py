@@ -202,6 +202,25 @@ def test_without_sampled_nodes_it_is_the_kalman_smoother() -> None:
     assert asked > 7
 
 
+def test_what_is_told_without_noise_across_a_gap() -> None:
+    """A place that moves by its speed alone, from a known start, seen exactly: later rows must add up."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add(
+        "p", lambda p_prev, v_prev: bmc.Normal(p_prev + v_prev, 0.0), initial=bmc.Normal(0.0, 0.0)
+    )
+    dbn.add("y", lambda p: bmc.Normal(p, 0.0))
+    rows = {"y": [0.0, np.nan, 0.5, 2.0, np.nan, np.nan, 3.0]}
+    right = bmc.smooth(dbn, rows, engine=bmc.KalmanFilter())
+    engine = bmc.ParticleFilter(3, marginalize="auto")
+    found = bmc.smooth(dbn, rows, engine=engine, rng=0)
+    for name in ("v", "p"):
+        assert off(found.mean(name), right.mean(name)) < 1e-6, name
+        assert off(found.var(name), right.var(name)) < 1e-6, name
+    v, p = found.particles("v"), found.particles("p")
+    np.testing.assert_allclose(p[1:], p[:-1] + v[:-1], atol=1e-5)  # draws add up, too
+
+
 def test_draws_beside_the_beliefs_are_joint_ones() -> None:
     """Covariances of neighbouring slices of 4,000 draws: 1e-3 is beyond four standard errors of them."""
     dbn = bmc.DynamicBayesNet()

@@ -182,12 +182,11 @@ def combined(message: Message, beliefs: Gaussians) -> Gaussians:
     look, factors = message.look[pairs // pools], beliefs.factors[pairs % pools]
     seen = look @ factors[..., :c, :]
     unit = np.broadcast_to(np.eye(seen.shape[-1]), (*seen.shape[:-2], *[seen.shape[-1]] * 2))
-    upper = np.linalg.qr(np.concatenate([seen, unit], axis=-2), mode="r")
-    lower = np.matrix_transpose(upper)[..., None, :, :]
-    after = solve_lower(lower, factors)
-    gain = after @ np.matrix_transpose(solve_lower(lower, seen))
+    basis, upper = np.linalg.qr(np.concatenate([seen, unit], axis=-2))
+    after = solve_lower(np.matrix_transpose(upper)[..., None, :, :], factors)
+    gain = after, np.matrix_transpose(basis[..., :r, :])  # one after the other: rows may be huge
     off = message.target - np.matvec(message.look[message.kind], beliefs.mean[..., :c])
-    mean = beliefs.mean + _times(gain, which, off)
+    mean = beliefs.mean + _times(gain[0], which, _times(gain[1], which, off))
     return beliefs._replace(mean=mean, factors=after, which=which, over=None)
 
 
