@@ -518,8 +518,6 @@ def test_what_does_not_go_together_is_refused_by_name() -> None:
         bmc.ParticleFilter(10, marginalize="auto", compiled=True)
     with pytest.raises(ValueError, match="nothing is named"):
         bmc.ParticleFilter(10, marginalize=[])
-    with pytest.raises(UnsupportedError, match="lag= answers by the ancestors"):
-        bmc.smooth(switching(), ROWS, engine=bmc.ParticleFilter(10, marginalize="auto"), lag=2)
     engine = bmc.ParticleFilter(10, marginalize="auto", proposal="optimal")
     reason = engine.unsupported(volatile(), ROWS)
     assert reason is not None and "'h', which is sampled, is not finite" in reason
@@ -558,4 +556,4 @@ def test_it_is_chosen_where_it_applies() -> None:
     assert "integrated out" in explained.nodes["x"]
     assert "'x' integrated out" in explained.reasons[0]
     lagged = bmc.explain(volatile(), ROWS, question="fixed-lag").engine
-    assert isinstance(lagged, bmc.ParticleFilter) and lagged.marginalize is None
+    assert isinstance(lagged, bmc.ParticleFilter) and lagged.marginalize == "auto"
