@@ -267,7 +267,8 @@ class ParticleFilter(FilterEngine):
         return filters if step.integrated else told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
-        return self.effort(problem) if asked.what == "filter" else marginal.back(self, problem, asked)
+        smoothed = marginal.back(self, problem, asked)
+        return self.effort(problem) if asked.what == "filter" else smoothed
 
     def filter(
         self,
