@@ -141,6 +141,8 @@ def why_not_backwards(slices: Slices, split: Split) -> str | None:
     apart = plates_apart(slices)
     if apart:
         return f"elements of plate {apart[0]!r} are filtered separately"
+    if bent := getattr(split, "linearised", ()):
+        return f"{min(bent)!r} is made linear at each particle's own mean, which paths change"
     carried = carried_on(slices, split.seen) - layouts_of(slices, split.inner, ())[1].unknown
     if carried:
         return f"{min(carried)!r} is computed from sampled nodes of the slice before, and read by the next"
