@@ -93,8 +93,8 @@ def errors_off(found: np.ndarray) -> float:
 
 @pytest.mark.parametrize("proposal", PROPOSALS)
 def test_the_evidence_has_no_bias(proposal: str | None) -> None:
-    runs = session.scaled(50, 40)
-    for seed, case, log in templates(session.scaled(2, 3)):
+    runs = session.scaled(40, 50)
+    for seed, case, log in templates(session.scaled(1, 6)):
         found = ratios(case, log, proposal, runs)
         told = seed, found.mean(), found.std(ddof=1) / np.sqrt(runs)
         print(f"template {seed}, {proposal}: {told[1]:.5f} +- {told[2]:.5f}")
@@ -106,6 +106,6 @@ def test_a_planted_fault_gives_it_one(fault: str) -> None:
     edit, proposal = FAULTS[fault]
     with planted(edit):
         assert any(
-            errors_off(ratios(case, log, proposal, session.scaled(60, 34))) > 4
+            errors_off(ratios(case, log, proposal, session.scaled(50, 40))) > 4
             for _, case, log in templates(session.scaled(2, 3))
         )
