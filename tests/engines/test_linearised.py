@@ -272,3 +272,15 @@ def test_what_has_no_tangent_is_refused_by_name(seen: Any, why: str) -> None:
         bmc.filter(dbn, {"y": [1, 2]}, engine=bmc.ParticleFilter(10, marginalize=["x"]))
     with pytest.raises(UnsupportedError, match="node 'y'"):
         bmc.filter(dbn, {"y": [1, 2]}, engine=bmc.ParticleFilter(10, marginalize=["x"]))
+
+
+def test_smoothing_draws_trajectories_of_all_nodes_and_says_so() -> None:
+    """Their density is the declared one: near the extended smoother, where nothing bends by much."""
+    drawn = pendulum().sample(8, rng=1)
+    rows = {"y": drawn["y"][0], "z": drawn["z"][0]}
+    engine = bmc.ParticleFilter(500, marginalize=["a", "v"])
+    told = bmc.explain(pendulum(), rows, engine=engine, question="smooth").effort
+    assert "nothing stays integrated out, as 'height' is made linear" in told
+    found = bmc.smooth(pendulum(), rows, engine=engine, rng=0)
+    right = bmc.smooth(pendulum(), rows, engine=bmc.ExtendedKalmanFilter())
+    assert np.abs((found.mean("a") - right.mean("a")) / right.std("a")).max() < 0.5

@@ -25,7 +25,7 @@ from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_del
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.lags import by_lag
-from bayesmc.engines.particles.layers import endless, not_backwards
+from bayesmc.engines.particles.layers import not_backwards
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
     BUDGET,
@@ -250,7 +250,7 @@ class ParticleFilter(FilterEngine):
             return NOT_SMOOTHED
         if (why := not_delayed(self.delay, asked)) is not None:
             return why
-        sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
+        sums = marginal.endless_sums(self, problem) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
@@ -258,9 +258,9 @@ class ParticleFilter(FilterEngine):
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
-        if self._integrates(problem):
-            return marginal.told(self, problem, found)
-        return found | looks_told(self, problem, found)
+        if not self._integrates(problem):
+            found |= looks_told(self, problem, found)
+        return marginal.told(self, problem, found)
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
@@ -269,7 +269,9 @@ class ParticleFilter(FilterEngine):
         return told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
-        found = self.effort(problem) if asked.what == "filter" else ""
+        found = (
+            self.effort(problem) if asked.what == "filter" else marginal.back(self, problem, asked)
+        )
         return ahead_told(self.delay, found)
 
     def filter(

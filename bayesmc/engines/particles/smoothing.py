@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries
+from bayesmc.engines.marginal.smoothing import MarginalBackward, why_not_backwards
 from bayesmc.engines.particles.backward import TRAJECTORIES, Backward
 from bayesmc.engines.particles.coalescence import Sharing
 from bayesmc.engines.particles.record import FilteredParticles, Record, filtered_by
@@ -37,7 +38,11 @@ def backwards(
     filtered = filtered_by(engine, step, problem, seed, True, {}, progress)
     assert filtered.held is not None
     count = asked.trajectories or min(step.layout.particles, TRAJECTORIES)
-    backward = Backward(step.plan, step.layout, asked.rejection, problem.seen)
+    backward: Any
+    if step.integrated and why_not_backwards(step.slices, step.split) is None:
+        backward = MarginalBackward(step, asked.rejection)
+    else:
+        backward = Backward(step.plan, step.layout, asked.rejection, problem.seen)
     with quiet():
         rng = stream(seed, Purpose.SMOOTH)
         found = backward.trajectories(filtered.held.particles, problem.series, count, rng)
