@@ -279,17 +279,18 @@ def ways(
 
 
 def engines(sweeps: int, particles: int) -> dict[str, tuple[Any, Any]]:
-    """What is asked, and of whom, by name."""
-    return {
+    """What is asked, and of whom, by name; without sweeps or particles not of those who have them."""
+    found: dict[str, tuple[Any, Any]] = {
         "filtered, GPB2": (bmc.filter, bmc.SwitchingKalmanFilter("gpb2")),
-        f"filtered, {particles} particles": (
-            bmc.filter,
-            bmc.ParticleFilter(particles, marginalize="auto", proposal="optimal"),
-        ),
         "smoothed, IMM and Kim": (bmc.smooth, bmc.SwitchingKalmanFilter("imm")),
         "smoothed, GPB2 and Kim": (bmc.smooth, bmc.SwitchingKalmanFilter("gpb2")),
-        f"smoothed, EP, {sweeps} sweeps": (bmc.smooth, bmc.ExpectationPropagation(sweeps)),
     }
+    if particles:
+        engine = bmc.ParticleFilter(particles, marginalize="auto", proposal="optimal")
+        found[f"filtered, {particles} particles"] = bmc.filter, engine
+    if sweeps:
+        found[f"smoothed, EP, {sweeps} sweeps"] = bmc.smooth, bmc.ExpectationPropagation(sweeps)
+    return found
 
 
 def report(rows: Any, labels: np.ndarray, found: Any, sweeps: int, particles: int) -> None:
@@ -384,7 +385,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if options.fast:
         rows, labels = {name: values[:480] for name, values in rows.items()}, labels[:480]
     found = ways(rows, labels, *((1, 3) if options.fast else (ROUNDS, STEPS)))
-    report(rows, labels, found, *((1, 20) if options.fast else (8, 200)))
+    report(rows, labels, found, *((0, 0) if options.fast else (8, 200)))
     picture.save(draw(rows, labels, found), options.out, "bee_dance")
 
 
