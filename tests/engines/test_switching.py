@@ -210,6 +210,38 @@ def test_readings_on_a_circle_say_the_same_whatever_north_is(engine: Any) -> Non
         bmc.filter(dbn, rows, engine=engine)
 
 
+@pytest.mark.parametrize("merging", RULES)
+def test_pairs_of_modes_that_cannot_be_need_no_numbers(merging: str) -> None:
+    """Of numbers in a mode that cannot be before nothing is known; a reading divides by the distance."""
+
+    def target(modes: bool) -> bmc.DynamicBayesNet:
+        dbn = bmc.DynamicBayesNet()
+        follow = [[0.8, 0.2], [0.3, 0.7]]
+        start = bmc.MvNormal([3.0, 4.0], 0.1 * np.eye(2))
+        if modes:
+            dbn.table("s", ["s_prev"], follow, initial=[1.0, 0.0])
+            dbn.add(
+                "x", lambda x_prev, s: bmc.MvNormal(x_prev + s[..., None], np.eye(2)), initial=start
+            )
+        else:
+            dbn.input("s")
+            dbn.add("x", lambda x_prev, s: bmc.MvNormal(x_prev + s, np.eye(2)), initial=start)
+        dbn.add("y", lambda x: bmc.Normal(x[..., 0] / np.hypot(x[..., 0], x[..., 1]), 0.2))
+        return dbn
+
+    rows = {"y": [0.6, 0.7]}
+    found = bmc.filter(target(True), rows, engine=SwitchingKalmanFilter(merging, linearize=True))
+    logs = [
+        bmc.filter(
+            target(False), rows, inputs={"s": [0.0, s]}, engine=bmc.ExtendedKalmanFilter()
+        ).log_marginal_likelihood
+        for s in (0.0, 1.0)
+    ]
+    total = np.logaddexp(np.log(0.8) + logs[0], np.log(0.2) + logs[1])
+    assert abs(found.log_marginal_likelihood - total) < 1e-9
+    assert abs(found.probabilities("s")[1, 1] - np.exp(np.log(0.2) + logs[1] - total)) < 1e-9
+
+
 # ---- published and independent figures ----------------------------------------------------------
 
 

@@ -334,7 +334,8 @@ class Stretch:
     def _needed(self) -> np.ndarray:
         """Which kinds can be in which slice, shape (time, kinds)."""
         found = np.zeros((self.count, len(self.pairs.of_kind)), dtype=bool)
-        np.logical_or.at(found, (slice(None), self.pairs.kind), self._possible)
+        for kinds, pairs in zip(found, self._possible, strict=True):
+            np.logical_or.at(kinds, self.pairs.kind, pairs)
         return found
 
     @cached_property
