@@ -1,7 +1,7 @@
 """Who answers what at which price and error: every filter that can, asked of one switching template.
 
-A level wanders, by little or by much, and nobody says which. There is one hidden number, so that a fine grid is
-exact to all digits shown, and what the others are off from. Filters of finite nodes have the level in cells.
+A level wanders, by little or by much, and nobody says which. There is one hidden number, so that a fine grid
+is exact to all digits shown, and what the others are off from. Filters of finite nodes have it in cells.
 Then smoothers are asked of the same with a sensor that breaks, which is harder. The table is that of
 ``docs/switching.md``.
 """
