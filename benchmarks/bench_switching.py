@@ -1,4 +1,4 @@
-"""``SwitchingKalmanFilter`` beside GPB2 by hand and FilterPy's IMM; expectation propagation beside its own."""
+"""``SwitchingKalmanFilter`` beside GPB2 by hand and FilterPy's IMM; expectation propagation by hand, too."""
 
 from __future__ import annotations
 
