@@ -15,6 +15,7 @@ from benchmarks import (
     bench_switching,
     bench_time,
     bench_weighting,
+    prices,
 )
 from benchmarks.harness import data_folder, peer_python
 
@@ -37,6 +38,8 @@ if __name__ == "__main__":
     bench_switching.main()
     print()
     bench_marginal.main()
+    print()
+    prices.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()
