@@ -1,0 +1,181 @@
+"""Coordinate ascent: sweeps over factors from several starts, the best of which go on until settled."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from bayesmc.engines.mcmc.starts import start_states
+from bayesmc.engines.variational.factors import State, TableFactor
+from bayesmc.engines.variational.plan import Plan
+from bayesmc.errors import BayesmcError
+from bayesmc.structure.target import Values
+
+#: how far a bound may fall by rounding, of its size
+ROUNDING = 1e-9
+#: sweeps that every start has before the best of them go on, and how many go on
+_FIRST, _KEPT = 60, 3
+#: gain of one sweep, of the bound's size, below which a start is taken to be near its end
+_NEAR = 1e-6
+#: how much coarser than the bound's tolerance that of the figures is
+_FIGURES = 10.0
+
+
+class BoundError(BayesmcError):
+    """The bound fell in a sweep: a fault of the library."""
+
+
+@dataclass(eq=False)
+class Ascent:
+    """One start, and how far it has come.
+
+    Attributes
+    ----------
+    state : dict
+        Moments.
+    bounds : list of float
+        The evidence bound after every sweep, up to what is known.
+    converged : bool
+    """
+
+    plan: Plan
+    state: State
+    memory: list[object]
+    bounds: list[float] = field(default_factory=list)
+    converged: bool = False
+    figures: list[np.ndarray] = field(default_factory=list)
+
+    def sweep(self) -> float:
+        """Improve every factor once; how far the figure that moved most has moved."""
+        plan, state = self.plan, self.state
+        for k in range(len(plan.factors)):
+            plan.update(k, state)
+        bound = plan.bound(state)
+        if self.bounds:
+            check_bound(self.bounds[-1], bound)
+        self.bounds.append(bound)
+        with np.errstate(all="ignore"):
+            figures = [f for factor in plan.factors for f in factor.spreads(state)]
+        moved = np.inf
+        if self.figures:
+            moved = max(
+                (_moved(a, b) for a, b in zip(self.figures, figures, strict=True)), default=0.0
+            )
+        self.figures = figures
+        return moved
+
+    def climb(self, sweeps: int, tolerance: float, near: float = 0.0) -> None:
+        """Sweep until it has settled, or the gain is below a share of the bound."""
+        for _ in range(sweeps):
+            moved = self.sweep()
+            if len(self.bounds) < 2:
+                continue
+            gain = self.bounds[-1] - self.bounds[-2]
+            size = 1.0 + abs(self.bounds[-1])
+            if gain <= tolerance * size and moved <= _FIGURES * tolerance:
+                self.converged = True
+                return
+            if gain < near * size:
+                return
+
+
+def check_bound(before: float, now: float) -> None:
+    """Raise where a bound has fallen, or is no number.
+
+    Raises
+    ------
+    BoundError
+
+    Examples
+    --------
+    >>> from bayesmc.engines.variational.ascent import check_bound
+    >>> check_bound(-3.0, -2.5)
+    >>> check_bound(-3.0, -3.5)
+    Traceback (most recent call last):
+    ...
+    bayesmc.engines.variational.ascent.BoundError: MeanField: the evidence bound fell ...
+    """
+    if not now >= before - ROUNDING * max(1.0, 1e-3 * abs(before)):
+        raise BoundError(
+            f"MeanField: the evidence bound fell from {before!r} to {now!r} in a sweep, which no coordinate "
+            "ascent does; please report this net"
+        )
+
+
+def ascents(plan: Plan, restarts: int, rng: np.random.Generator) -> Iterator[Ascent]:
+    """Starts far apart, one by one."""
+    values = start_states(plan.target, restarts, rng)
+    for k in range(restarts):
+        yield started(plan, values, k, rng)
+
+
+def best_of(
+    plan: Plan, restarts: int, sweeps: int, tolerance: float, rng: np.random.Generator
+) -> list[Ascent]:
+    """All starts, the best first; it has settled, or used up its sweeps."""
+    found = []
+    for ascent in ascents(plan, restarts, rng):
+        ascent.climb(min(_FIRST, sweeps), tolerance, _NEAR)
+        found.append(_stored(plan, ascent))
+    found.sort(key=lambda a: -a.bounds[-1])
+    best, rest = found[:_KEPT], found[_KEPT:]
+    for ascent in best:
+        _restored(plan, ascent)
+        if not ascent.converged:
+            ascent.climb(sweeps - len(ascent.bounds), tolerance)
+        _stored(plan, ascent)
+    best.sort(key=lambda a: -a.bounds[-1])
+    _restored(plan, best[0])
+    return best + rest
+
+
+def started(plan: Plan, values: Values, k: int, rng: np.random.Generator) -> Ascent:
+    """Moments of the k-th start state; labels are seeded.
+
+    Of the many elements of a plate a few are given to each state, others are left out until tables are
+    updated: so components begin about random elements, and the first of the restarts with one element each.
+    """
+    state: State = {}
+    target = plan.target
+    own = {n: v if target.is_known(n) else v[k] for n, v in values.items()}
+    plan.start(state, own)
+    for place, factor in enumerate(plan.factors):
+        if isinstance(factor, TableFactor):
+            state[factor.table] = _seeded(factor, state[factor.table], k, rng)
+            plan.add_up(state, plan._steps[place][2])
+    return Ascent(plan, state, [])
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _seeded(factor: TableFactor, table: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
+    size, count = factor.size, int(np.prod(factor.shape[1:], dtype=int))
+    if count < 2 * size:
+        found = rng.dirichlet(np.ones(size), count).T.reshape(factor.shape)
+    else:
+        each = (1, max(1, count // (4 * size)), 3)[k % 3]
+        picked = rng.choice(count, size=(size, min(each, count // size)), replace=False)
+        flat = np.zeros((size, count))
+        flat[np.arange(size)[:, None], picked] = 1.0
+        found = flat.reshape(factor.shape)
+    return found if factor.seen is None else np.where(factor.seen, table, found)
+
+
+def _moved(before: np.ndarray, now: np.ndarray) -> float:
+    with np.errstate(invalid="ignore"):
+        off = np.abs(now - before)
+    return float(np.nanmax(off, initial=0.0))
+
+
+def _stored(plan: Plan, ascent: Ascent) -> Ascent:
+    """What the factors know besides moments is kept with the start."""
+    ascent.memory = [dict(f.__dict__) for f in plan.factors]
+    return ascent
+
+
+def _restored(plan: Plan, ascent: Ascent) -> None:
+    for factor, known in zip(plan.factors, ascent.memory, strict=True):
+        factor.__dict__.update(known)  # type: ignore[arg-type]

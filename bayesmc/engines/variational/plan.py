@@ -1,0 +1,408 @@
+"""Which factor each hidden node has, and the programs of a sweep."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.variational.factors import (
+    Factor,
+    NormalFactor,
+    ScatterFactor,
+    ShareFactor,
+    State,
+    TableFactor,
+)
+from bayesmc.engines.variational.free import FREE, FreeFactor
+from bayesmc.engines.variational.reading import LabelTerm, Sum, TermReader, has_moments
+from bayesmc.errors import TraceError, UnsupportedError
+from bayesmc.expression import Expression, Program
+from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.passes.arrays import for_arrays
+from bayesmc.passes.derivatives import gradient
+from bayesmc.passes.moments import Hidden, Meeting, NoMoment, moment
+from bayesmc.structure.target import Target
+
+#: elements of a plate that are made jointly normal where they meet
+_JOINT = 400
+#: relative error that the energy of points may have
+_ROUNDING = 1e-8
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A mean-field approximation, ready to be improved.
+
+    Attributes
+    ----------
+    target : Target
+    factors : tuple of Factor
+        In the order of a sweep: numbers first, then tables.
+    sums : tuple of Sum
+        The terms' expectations.
+    free : FreeFactor or None
+    why : dict
+        Node -> what kind of factor it has, and why no closer one.
+    """
+
+    target: Target
+    factors: tuple[Factor, ...]
+    sums: tuple[Sum, ...]
+    free: FreeFactor | None
+    why: dict[str, str]
+    _steps: dict[int, Any] = field(default_factory=dict, repr=False)
+
+    def __post_init__(self) -> None:
+        self.__dict__["labels"] = [s.by_label for s in self.sums if s.by_label is not None]
+        for k, factor in enumerate(self.factors):
+            self._steps[k] = self._prepared(factor)
+        self.__dict__["_energy"] = Program(for_arrays([_total(s.total for s in self.sums)]))
+
+    def update(self, k: int, state: State) -> None:
+        """Make a factor the best given all others."""
+        factor = self.factors[k]
+        program, names, by_label = self._steps[k]
+        slopes = {name: np.zeros(0) for name in factor.moments}
+        if program is not None and not isinstance(factor, FreeFactor):
+            for name, value in zip(names, program(state), strict=True):
+                slopes[name] = self._averaged(value, name)
+        for name, shape in self.shapes(factor):
+            if not slopes[name].shape or slopes[name].shape != shape:
+                slopes[name] = (
+                    np.broadcast_to(slopes[name], shape) if slopes[name].size else np.zeros(shape)
+                )
+        for label, coefficients in by_label:
+            (table,) = coefficients(state)
+            table = self._mean(table, 2)
+            found = table @ label.statistics
+            name = factor.moments[0]
+            slopes[name] = slopes[name] + found.reshape(slopes[name].shape)
+        factor.update(state, slopes)
+        if by_label:
+            self.add_up(state, by_label)
+
+    def add_up(self, state: State, by_label: Sequence[tuple[LabelTerm, Any]]) -> None:
+        """Sums of statistics under new tables."""
+        for label, _ in by_label:
+            table = state[moment(label.label, "table")]
+            state[label.sums.name] = table.reshape(len(table), -1) @ label.statistics.T
+
+    def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
+        for k, factor in enumerate(self.factors):
+            factor.start(state, values)
+            self.add_up(state, self._steps[k][2])
+
+    def bound(self, state: State) -> float:
+        """The evidence lower bound, up to factors of what is known."""
+        total = self.energy(state) + sum(f.entropy(state) for f in self.factors)
+        return total if self.free is None else total + self.free.bound_parts(state)
+
+    def energy(self, state: State) -> float:
+        """The expected log joint density."""
+        (found,) = self._energy(state)  # type: ignore[attr-defined]
+        found = np.asarray(found)
+        return self.free.average(found) if self.free is not None else float(found)
+
+    def shapes(self, factor: Factor) -> list[tuple[str, tuple[int, ...]]]:
+        return [] if isinstance(factor, FreeFactor) else self._shapes[factor.names]  # type: ignore[attr-defined]
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _mean(self, value: np.ndarray, rank: int) -> np.ndarray:
+        """Averages over the points of free numbers, where it depends on these."""
+        if np.ndim(value) == rank or self.free is None:
+            return value
+        return np.tensordot(self.free.weights, value, 1)
+
+    def _averaged(self, value: np.ndarray, name: str) -> np.ndarray:
+        value = np.asarray(value)
+        return self._mean(value, len(self._rank[name]))  # type: ignore[attr-defined]
+
+    def _prepared(self, factor: Factor) -> Any:
+        """The program of its slopes, their names, and what labels it says."""
+        ranks = self.__dict__.setdefault("_rank", {})
+        shapes = self.__dict__.setdefault("_shapes", {})
+        if isinstance(factor, FreeFactor):
+            factor.prepare(_total(s.total for s in self.sums if FREE in s.total.leaves))
+            return None, (), ()
+        own = set(factor.moments)
+        is_table = isinstance(factor, TableFactor)
+        used = [
+            s.total
+            for s in self.sums
+            if s.total.leaves & own and not (is_table and s.by_label is not None)
+        ]
+        by_label = [
+            (t, Program(for_arrays([t.coefficients])))
+            for t in self.labels  # type: ignore[attr-defined]
+            if is_table and t.label == factor.names[0]
+        ]
+        slopes = gradient(_total(used), factor.moments) if used else {}
+        names = tuple(slopes)
+        found = []
+        for name, shape in _shapes_of(factor):
+            ranks[name] = shape
+            found.append((name, shape))
+        shapes[factor.names] = found
+        program = Program(for_arrays([slopes[n] for n in names])) if names else None
+        return program, names, by_label
+
+
+def plan_for(target: Target, blocks: Sequence[Sequence[str]]) -> Plan:
+    """The factors of a posed problem.
+
+    Raises
+    ------
+    UnsupportedError
+        A node can have none.
+    """
+    chooser = _Chooser(target, blocks)
+    while True:
+        try:
+            return chooser.attempt()
+        except Meeting as error:
+            for name in error.names:
+                chooser.join(name)
+        except NoMoment as error:
+            chooser.release(error)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _shapes_of(factor: Factor) -> list[tuple[str, tuple[int, ...]]]:
+    if isinstance(factor, TableFactor):
+        return [(factor.table, factor.shape)]
+    owns = [factor.own]  # type: ignore[attr-defined]
+    if isinstance(factor, ScatterFactor) and factor.location is not None:
+        owns.append(factor.location)
+    known = {
+        moment(o.name, f): o.moment(f).shape
+        for o in owns
+        for f in ("mean", "cov", "spread", "x", "inv", "log", "log1m")
+        if f != "cov" or o.kind == "number"
+    }
+    return [(name, known[name]) for name in factor.moments]
+
+
+class _Chooser:
+    """Tries closed forms, and releases nodes that have none."""
+
+    def __init__(self, target: Target, blocks: Sequence[Sequence[str]]) -> None:
+        self.target = target
+        self.free: dict[str, str] = {}
+        self.joined: set[str] = set()
+        self.scales: dict[str, str] = {}
+        self.kinds: dict[str, str] = {}
+        self.tables: dict[str, int] = {}
+        for name in target.chain:
+            node = target.model[name]
+            seen = target.seen(name)
+            if node.domain is not None:
+                self.tables[name] = node.domain.size
+                continue
+            kind = has_moments(target, name)
+            if kind is None:
+                self.free[name] = "its support has no closed form"
+            else:
+                self.kinds[name] = kind
+            if seen is not None and seen.parts is not None:
+                raise UnsupportedError(
+                    f"MeanField: components of node {name!r} are observed one by one; use Gibbs()"
+                )
+        for block in blocks:
+            self._block(tuple(block))
+
+    def _block(self, block: tuple[str, ...]) -> None:
+        for name in block:
+            if name not in self.target.chain:
+                raise UnsupportedError(
+                    f"MeanField(blocks=): {name!r} is no hidden node that something observed depends on"
+                )
+            if name in self.tables:
+                raise UnsupportedError(
+                    f"MeanField(blocks=): node {name!r} is finite; finite nodes are factors of their own"
+                )
+        scales = [n for n in block if self.kinds.get(n) in ("positive", "matrix")]
+        means = [n for n in block if self.kinds.get(n) == "number"]
+        if len(block) == 2 and len(scales) == len(means) == 1:
+            shapes = [self.target.model[n] for n in (means[0], scales[0])]
+            same = shapes[0].plate_shape == shapes[1].plate_shape
+            if same and self.target.seen(means[0]) is None and self.target.seen(scales[0]) is None:
+                self.scales[means[0]] = scales[0]
+                return
+        for name in block:
+            self.free[name] = (
+                f"it is asked for jointly with {', '.join(n for n in block if n != name)}"
+            )
+
+    def join(self, name: str) -> None:
+        """Make all elements of a node jointly normal."""
+        size = math.prod(self.target.model[name].value_shape)
+        if name in self.joined or size > _JOINT:
+            self.free[name] = f"its {size} elements meet in one term"
+        self.joined.add(name)
+
+    def release(self, error: NoMoment) -> None:
+        """Make nodes normal in unconstrained coordinates."""
+        new = [n for n in error.names if n not in self.free]
+        if not new:
+            raise UnsupportedError(f"MeanField: {error}")
+        for name in new:
+            self.free[name] = str(error)
+            for mean, scale in list(self.scales.items()):
+                if name in (mean, scale):
+                    other = scale if name == mean else mean
+                    self.free.setdefault(other, f"it is a block with {name!r}: {error}")
+                    del self.scales[mean]
+
+    def attempt(self) -> Plan:
+        target = self.target
+        free = FreeFactor(target, list(self.free)) if self.free else None
+        above = {} if free is None else free.above
+        hidden = {n: self._hidden(n) for n in self.kinds if n not in self.free}
+        reader = TermReader(target, hidden, self.tables, above)
+        sums = []
+        for term in target.terms.values():
+            try:
+                sums.append(reader(term))
+            except (NoMoment, UnsupportedError):
+                raise
+            except TraceError as error:
+                kind = "potential" if term.is_potential else "node"
+                raise UnsupportedError(f"MeanField: {kind} {term.name!r}: {error}") from error
+        leaves = frozenset().union(*(s.total.leaves for s in sums))
+        if free is not None:
+            stray = free.volume.leaves & {*hidden, *self.tables}
+            if stray:
+                raise NoMoment("the bounds of another node depend on it", stray)
+        factors = self._factors(hidden, leaves)
+        if free is not None:
+            factors.append(free)
+        factors += [self._table(n) for n in self.tables]
+        try:
+            plan = Plan(target, tuple(factors), tuple(sums), free, self._why(factors))
+        except TraceError as error:
+            raise UnsupportedError(f"MeanField: {error}") from error
+        hold_at_points(plan)
+        return plan
+
+    def _hidden(self, name: str) -> Hidden:
+        node, kind = self.target.model[name], self.kinds[name]
+        width = math.prod(node.event_shape) if kind == "number" else 1
+        if name in self.joined:
+            width = math.prod(node.value_shape)
+        return Hidden(name, kind, node.value_shape, width, self.scales.get(name))
+
+    def _factors(self, hidden: Mapping[str, Hidden], leaves: frozenset[str]) -> list[Factor]:
+        found: list[Factor] = []
+        means = {scale: mean for mean, scale in self.scales.items()}
+        for name, own in hidden.items():
+            seen = self.target.seen(name)
+            mask = None if seen is None else np.broadcast_to(seen.mask, self._plates(name))  # type: ignore
+            uses = {f for f in ("x", "inv", "log", "log1m") if moment(name, f) in leaves}
+            if own.kind == "number":
+                if own.scale is None:
+                    found.append(NormalFactor(own, mask))
+            elif own.kind in ("positive", "matrix"):
+                if {"x", "inv"} <= uses:
+                    raise NoMoment("terms want its mean and that of its inverse", [name])
+                mean = means.get(name)
+                location = None if mean is None else hidden[mean]
+                found.append(ScatterFactor(own, "inv" in uses, location, mask))
+            elif "x" in uses:
+                raise NoMoment("terms want its mean and that of its logarithm", [name])
+            else:
+                found.append(ShareFactor(own, mask))
+        return found
+
+    def _table(self, name: str) -> TableFactor:
+        node, seen = self.target.model[name], self.target.seen(name)
+        mask = None if seen is None else np.broadcast_to(seen.mask, node.plate_shape)  # type: ignore
+        assert node.domain is not None
+        return TableFactor(name, node.domain.size, node.plate_shape, mask)
+
+    def _plates(self, name: str) -> tuple[int, ...]:
+        return self.target.model[name].plate_shape
+
+    def _why(self, factors: Sequence[Factor]) -> dict[str, str]:
+        found = {}
+        for factor in factors:
+            for name in factor.names:
+                found[name] = self._words(factor, name)
+        return found
+
+    def _words(self, factor: Factor, name: str) -> str:
+        if isinstance(factor, FreeFactor):
+            shape = "full" if factor.is_full else "diagonal"
+            return (
+                f"normal in unconstrained coordinates ({shape} covariance of {factor.size} numbers, "
+                f"{len(factor.weights)} points): {self.free[name]}"
+            )
+        if isinstance(factor, TableFactor):
+            return f"closed form: a table of {factor.size} states for every element"
+        if isinstance(factor, NormalFactor):
+            joint = ", all elements jointly, since they meet" if name in self.joined else ""
+            return f"closed form: normal{joint}"
+        if isinstance(factor, ScatterFactor):
+            pair = {True: ("inverse gamma", "inverse Wishart"), False: ("gamma", "Wishart")}
+            kind = pair[factor.is_inverse][factor.own.kind == "matrix"]
+            if factor.location is not None:
+                return (
+                    f"closed form: normal and {kind} jointly ({factor.names[0]}, {factor.names[1]})"
+                )
+            return f"closed form: {kind}"
+        return f"closed form: {'Dirichlet' if factor.own.kind == 'simplex' else 'beta'}"  # type: ignore
+
+
+def _total(parts: Any) -> Expression:
+    total: Expression = ZERO
+    for part in parts:
+        total = add(total, part)
+    return total
+
+
+def hold_at_points(plan: Plan) -> None:
+    """Refuse an energy that differs from the model's own log density where every factor is a point.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    target = plan.target
+    if target.states is None:
+        return
+    for row in (0, -1):
+        values = {
+            n: v if target.is_known(n) else v[row][None] for n, v in target.states.items()
+        }
+        for name in target.chain:
+            seen = target.seen(name)
+            if seen is not None:
+                node = target.model[name]
+                inner = (1,) * len(node.event_shape)
+                mask = np.broadcast_to(seen.mask, node.plate_shape).reshape(
+                    node.plate_shape + inner
+                )  # type: ignore
+                values[name] = np.where(mask, seen.value, values[name])
+        target.refresh(values, target.chain)
+        with np.errstate(all="ignore"):
+            want = float(np.ravel(target.log_density(values))[0])
+            state: State = {}
+            plan.start(state, {n: values[n][0] for n in target.chain})
+            if plan.free is not None:
+                state[FREE] = np.broadcast_to(
+                    plan.free.mean, (len(plan.free.weights), plan.free.size)
+                )
+            found = plan.energy(state)
+        if not np.isfinite(want):
+            continue
+        if not abs(found - want) <= _ROUNDING * (1.0 + abs(want)) * 10:
+            raise UnsupportedError(
+                f"MeanField: what was read of the net gives the log density {found:.10g} at a point where "
+                f"its functions give {want:.10g}; use another engine, and report this"
+            )

@@ -1,0 +1,421 @@
+"""The expected log joint density of a net under independent factors, as an expression of their moments.
+
+Every term is read off its graph (``passes.expectation``). Finite nodes are taken at each of their states, and
+their tables are the weights; what a known plate says by one label is a product of its statistics with
+coefficients by label, so that a sweep over a mixture is two products of matrices. Nodes that stand in the way
+of closed forms become normal in unconstrained coordinates, and are values there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import InverseWishart, LogNormal, MvNormal, Normal, Wishart
+from bayesmc.engines.variational.factors import IMPOSSIBLE
+from bayesmc.errors import TraceError, UnsupportedError
+from bayesmc.expression import (
+    Constant,
+    Expression,
+    Family,
+    Leaf,
+    as_expression,
+    broadcast,
+    constant,
+    elementwise,
+    expressions_of,
+    leaf,
+    mapped,
+    ordered,
+    pick,
+    reduction,
+    reshape,
+)
+from bayesmc.expression.graph import cast, substituted
+from bayesmc.kernels.label_sums import label_sums
+from bayesmc.network.expressions import Opaque, stored_leaf
+from bayesmc.passes.arithmetic import add, multiply, subtract, tidied, tidy
+from bayesmc.passes.expectation import Expectation
+from bayesmc.passes.expected_density import (
+    expected_log_density,
+    plain_density,
+    quadratic_moments,
+)
+from bayesmc.passes.log_density import family_of
+from bayesmc.passes.moments import Hidden, NoMoment, moment
+from bayesmc.passes.reads import element_read
+from bayesmc.passes.widening import widened
+from bayesmc.structure.free_terms import elements, known_values
+from bayesmc.structure.target import Target, Term
+
+#: entries of one term at all joint states of its finite nodes
+_MOST = 1 << 23
+#: axes of one value of each parameter, of families that are taken apart
+_NDIM: dict[Any, Mapping[str, int]] = {
+    Normal: {"loc": 0, "scale": 0},
+    LogNormal: {"loc": 0, "scale": 0},
+    MvNormal: {"loc": 1, "cov": 2, "scale_tril": 2, "scale_diag": 1},
+    Wishart: {"df": 0, "scale": 2},
+    InverseWishart: {"df": 0, "scale": 2},
+}
+
+
+@dataclass(frozen=True, eq=False)
+class LabelTerm:
+    """What elements of a plate say by a label, ``sum_j statistics[j, n] * coefficients[label_n, j]``.
+
+    Attributes
+    ----------
+    label : str
+    statistics : ndarray, shape (rows, elements)
+    coefficients : Expression, shape (states, rows)
+        Of moments.
+    sums : Leaf, shape (states, rows)
+        Expected sums of the statistics by label.
+    """
+
+    label: str
+    statistics: np.ndarray
+    coefficients: Expression
+    sums: Leaf
+
+    @property
+    def total(self) -> Expression:
+        return reduction(np.add, multiply(self.sums, self.coefficients), (0, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Sum:
+    """A term's expectation, summed over its elements: a number, or by label."""
+
+    term: str
+    plain: Expression | None = None
+    by_label: LabelTerm | None = None
+
+    @property
+    def total(self) -> Expression:
+        found = self.plain if self.by_label is None else self.by_label.total
+        assert found is not None
+        return found
+
+
+class TermReader:
+    """Reads terms under a choice of factors.
+
+    Parameters
+    ----------
+    target : Target
+    hidden : mapping
+        Node -> ``Hidden``: what has a closed form.
+    tables : mapping
+        Finite node -> how many states it has.
+    above : mapping
+        Node -> its value, of those that are normal in unconstrained coordinates.
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        hidden: Mapping[str, Hidden],
+        tables: Mapping[str, int],
+        above: Mapping[str, Expression],
+    ) -> None:
+        self.target, self.hidden, self.tables, self.above = target, hidden, tables, above
+
+    def __call__(self, term: Term) -> Sum:
+        """The expectation of a term.
+
+        Raises
+        ------
+        NoMoment
+            It has none in closed form.
+        UnsupportedError
+            It cannot be followed.
+        """
+        whole = term.expression
+        moving = frozenset() if whole is None else whole.leaves & {*self.hidden, *self.tables}
+        if not moving:  # says why it is not followed, too
+            log = elements(self.target, term, self.above, term.name in self.above)
+            return Sum(term.name, reduction(np.add, log, (0,)))
+        assert whole is not None
+        given = self._given(term, whole)
+        whole = substituted(whole, given)
+        finite = sorted(whole.leaves & set(self.tables))
+        if term.is_potential:
+            return Sum(
+                term.name,
+                self._summed(term, self._of_expression(term, whole, finite), finite, whole),
+            )
+        assert not isinstance(term.read, Opaque)
+        read = term.read.result
+        family = read if isinstance(read, Family) else family_of(read)
+        family = mapped(family, lambda e: substituted(e, given))
+        value = self._value(term, given)
+        if len(finite) == 1:
+            found = self._by_label(term, family, value, finite[0])
+            if found is not None:
+                return Sum(term.name, None, found)
+        of = self._expectation(term)
+        if family.make in _NDIM:
+            grid, count = self._grid(finite)
+            made = _padded(family, len(term.shape))
+            node = self.target.model[term.name]
+            own = reshape(value, (1,) * (len(node.value_shape) - len(value.shape)) + value.shape)
+            if finite:
+                made = mapped(made, lambda e: _wide(e, grid, count))
+                own = _wide(own, grid, count)
+            log = expected_log_density(of, made, own)
+        else:
+            base = broadcast(plain_density(family, value), term.shape)
+            log = self._of_expression(term, base, finite)
+        return Sum(term.name, self._summed(term, log, finite, whole))
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _expectation(self, term: Term) -> Expectation:
+        return Expectation(self.hidden, [term.name] if term.name in self.hidden else [])
+
+    def _given(self, term: Term, whole: Expression) -> dict[str, Expression]:
+        read = term.read
+        parts = [] if isinstance(read, Opaque) or term.is_potential else expressions_of(read.result)
+        return {**known_values(self.target, [whole, *parts]), **self.above}
+
+    def _value(self, term: Term, given: Mapping[str, Expression]) -> Expression:
+        """The value of a term's node as its distribution speaks of it."""
+        node = self.target.model[term.name]
+        value: Expression = stored_leaf(self.target.model, node)
+        if term.name in self.target.known and self.target.is_known(term.name):
+            known = np.broadcast_to(self.target.known[term.name], value.shape)
+            value = cast(known, value.dtype)
+        value = substituted(value, dict(given))
+        if node.domain is not None and node.domain.low:
+            value = elementwise(np.add, value, node.domain.low)
+        return value
+
+    def _of_expression(self, term: Term, base: Expression, finite: Sequence[str]) -> Expression:
+        grid, count = self._grid(finite)
+        base = tidied(base)
+        return self._expectation(term)(widened(base, grid, count) if finite else base)
+
+    def _grid(self, finite: Sequence[str]) -> tuple[dict[str, Expression], int]:
+        """Every joint state of finite nodes, the same for all elements."""
+        sizes = [self.tables[n] for n in finite]
+        count = math.prod(sizes)
+        grid = {}
+        for name, states in zip(finite, self._states(finite), strict=True):
+            shape = self.target.model[name].value_shape
+            if count * math.prod(shape) > _MOST:
+                raise UnsupportedError(f"{count} joint states of {', '.join(finite)}: too many")
+            whole = states.reshape((-1,) + (1,) * len(shape))
+            grid[name] = constant(np.broadcast_to(whole, (count, *shape)))
+        return grid, count
+
+    def _states(self, finite: Sequence[str]) -> list[np.ndarray]:
+        sizes = [self.tables[n] for n in finite]
+        return [g.reshape(-1) for g in np.meshgrid(*map(np.arange, sizes), indexing="ij")]
+
+    def _summed(
+        self, term: Term, log: Expression, finite: Sequence[str], whole: Expression
+    ) -> Expression:
+        """A log factor summed over its elements, weighted by the tables of finite nodes."""
+        shape = (math.prod(self.tables[n] for n in finite), *term.shape) if finite else term.shape
+        if math.prod(shape) > _MOST:
+            raise UnsupportedError(
+                f"MeanField: term {term.name!r} has {math.prod(shape)} entries at all joint states of "
+                f"{', '.join(map(repr, finite))}"
+            )
+        log = _possible(broadcast(log, shape))
+        if term.mask is not None:
+            log = tidy(np.where, np.broadcast_to(term.mask, term.shape), log, 0.0)
+        for name, states in zip(finite, self._states(finite), strict=True):
+            log = multiply(log, self._weights(term, name, states, whole))
+        return reduction(np.add, log, range(len(log.shape)))
+
+    def _weights(self, term: Term, name: str, states: np.ndarray, whole: Expression) -> Expression:
+        node = self.target.model[name]
+        own = leaf(moment(name, "table"), (self.tables[name], *node.value_shape))
+        size = math.prod(node.value_shape)
+        try:
+            at = element_read(whole, name, np.arange(size).reshape(node.value_shape))
+        except TraceError as error:
+            raise UnsupportedError(
+                f"MeanField: an entry of {term.name!r} reads several elements of {name!r}: {error}"
+            ) from error
+        if not isinstance(at, Constant):
+            raise UnsupportedError(
+                f"MeanField: which element of finite node {name!r} {term.name!r} reads hangs on other nodes"
+            )
+        place = np.maximum(np.broadcast_to(at.value, term.shape), 0)
+        rows = states.reshape((-1,) + (1,) * place.ndim) * size
+        return pick([own], rows + place)
+
+    # ---- labels ------------------------------------------------------------------------------------
+
+    def _by_label(
+        self, term: Term, family: Family, value: Expression, label: str
+    ) -> LabelTerm | None:
+        node = self.target.model[label]
+        if term.shape != node.plate_shape or not node.plate_shape or term.mask is not None:
+            return None
+        of, states = self._expectation(term), self.tables[label]
+        if term.name == label:
+            return self._prior(of, term, family, states)
+        if family.make not in (Normal, LogNormal, MvNormal) or not isinstance(value, Constant):
+            return None
+        found = self._at_labels(term, label, states)
+        if found is None:
+            return None
+        y = np.log(value.value) if family.make is LogNormal else value.value
+        is_vector = family.make is MvNormal
+        y = y.reshape(-1, y.shape[-1] if is_vector else 1)
+        centre = y.mean(axis=0)
+        off = y - centre
+        d = off.shape[1]
+        loc = found.parameters["loc"]
+        loc = subtract(loc if is_vector else reshape(loc, (*loc.shape, 1)), centre)
+        precision, b, form, logs = quadratic_moments(of, loc, found.parameters, is_vector)
+        first = multiply(0.5, subtract(subtract(logs, form), d * math.log(2 * math.pi)))
+        parts = [broadcast(first, (states,))]
+        rows = [np.ones(len(off))]
+        b, precision = broadcast(b, (states, d)), broadcast(precision, (states, d, d))
+        for i in range(d):
+            parts.append(pick([b], np.arange(states) * d + i))
+            rows.append(off[:, i])
+        for i, j in zip(*np.tril_indices(d), strict=True):
+            parts.append(
+                multiply(
+                    -0.5 if i == j else -1.0,
+                    pick([precision], np.arange(states) * d * d + i * d + j),
+                )
+            )
+            rows.append(off[:, i] * off[:, j])
+        if family.make is LogNormal:
+            parts[0] = add(parts[0], -float(y.mean()))
+        at = np.arange(states * len(parts)).reshape(len(parts), states).T
+        return self._label_term(term, label, np.array(rows), pick(parts, at))
+
+    def _at_labels(self, term: Term, label: str, states: int) -> Family | None:
+        """A term's family at every label, parameters ``(states, *event)`` or one for all."""
+        found = label_sums(self.target, term, label)
+        if found is None or found.repeats > 1:
+            return None
+        family = found.family
+        parts = [*expressions_of(family)]
+        given = {**known_values(self.target, parts), **self.above}
+        family = mapped(family, lambda e: substituted(e, given))
+        made: dict[str, Any] = {}
+        for name, value in family.parameters.items():
+            made[name] = value
+            if value is not None:
+                inner = value.shape[len(value.shape) - _NDIM[family.make][name] :]
+                count = value.size // math.prod(inner)
+                if count not in (1, states):
+                    return None
+                made[name] = reshape(value, (count, *inner))
+        return Family(family.make, made)
+
+    def _prior(self, of: Expectation, term: Term, family: Family, states: int) -> LabelTerm | None:
+        """A label's own probabilities, where they are the same for all elements."""
+        node = self.target.model[term.name]
+        ndim = getattr(family.make, "parameter_ndim", None)
+        low = 0 if node.domain is None else node.domain.low
+        if ndim is None:
+            return None
+        made: dict[str, Any] = {}
+        for name, value in family.parameters.items():
+            if value is None:
+                made[name] = None
+                continue
+            if not isinstance(value, Expression) or name not in ndim:
+                return None
+            inner = value.shape[len(value.shape) - ndim[name] :]
+            if value.size != math.prod(inner):
+                return None
+            made[name] = reshape(value, (1, *inner))
+        value = as_expression(np.arange(states) + low)
+        log = broadcast(plain_density(Family(family.make, made), value), (states,))
+        found = _possible(of(tidied(log)))
+        rows = np.ones((1, math.prod(node.plate_shape)))
+        return self._label_term(
+            term, term.name, rows, reshape(broadcast(found, (states,)), (states, 1))
+        )
+
+    def _label_term(
+        self, term: Term, label: str, rows: np.ndarray, coefficients: Expression
+    ) -> LabelTerm:
+        sums = leaf(f"sums of \0{term.name}", coefficients.shape)
+        return LabelTerm(label, rows, coefficients, sums)
+
+
+def has_moments(target: Target, name: str) -> str | None:
+    """The kind of distribution that a continuous node may have in closed form; None for none.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.variational.reading import has_moments
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.Gamma(2.0, 1.0))
+    >>> net.add("count", lambda rate: bmc.Poisson(rate))
+    >>> has_moments(target_of(pose(net, {"count": 3})), "rate")
+    'positive'
+    """
+    support = target.model[name].support
+    if support is None or not support.is_single:
+        return None
+    low, high = float(np.ravel(support.low)[0]), float(np.ravel(support.high)[0])
+    if support.kind in ("real", "real vector"):
+        return "number"
+    if support.kind == "interval" and low == 0 and high == np.inf:
+        return "positive"
+    if support.kind == "interval" and (low, high) == (0, 1):
+        return "unit"
+    if support.kind == "interval" and (low, high) == (-np.inf, np.inf):
+        return "number"
+    return {"simplex": "simplex", "positive definite": "matrix"}.get(support.kind)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _padded(family: Family, rank: int) -> Family:
+    """Parameters with as many axes of elements as the term has plates."""
+    ndim = _NDIM[family.make]
+
+    def full(name: str, value: Any) -> Any:
+        if value is None:
+            return None
+        lead = rank - (len(value.shape) - ndim[name])
+        return reshape(value, (1,) * lead + value.shape)
+
+    return Family(family.make, {k: full(k, v) for k, v in family.parameters.items()})
+
+
+def _wide(node: Expression, grid: Mapping[str, Expression], count: int) -> Expression:
+    """At all joint states, which are the first axis; of size 1 where they do not matter."""
+    if node.leaves & grid.keys():
+        return widened(node, grid, count)
+    return reshape(node, (1, *node.shape))
+
+
+def _possible(log: Expression) -> Expression:
+    """A log factor that is finite, so that products with a probability of 0 are 0."""
+    for node in _constants(log):
+        if (node.value == -np.inf).any():
+            return elementwise(np.maximum, log, IMPOSSIBLE)
+    return log
+
+
+def _constants(root: Expression) -> Iterator[Constant]:
+    for node in ordered(root):
+        if isinstance(node, Constant) and node.dtype.kind == "f":
+            yield node
+
+
+__all__ = ["LabelTerm", "NoMoment", "Sum", "TermReader", "has_moments"]
