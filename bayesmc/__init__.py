@@ -47,6 +47,7 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
+from bayesmc.engines.approximate.laplace import LaplaceApproximation
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
@@ -116,6 +117,7 @@ __all__ = [
     "KalmanFilter",
     "KernelDensity",
     "Laplace",
+    "LaplaceApproximation",
     "LikelihoodWeighting",
     "LogNormal",
     "Marginal",

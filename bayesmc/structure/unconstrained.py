@@ -13,6 +13,7 @@ Derivatives, 2nd ed., sec. 3.2.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import (
     Expression,
     Leaf,
+    as_expression,
     broadcast,
     leaf,
     pick,
@@ -27,7 +29,7 @@ from bayesmc.expression import (
 )
 from bayesmc.expression.graph import substituted
 from bayesmc.passes.alike import sums_of
-from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.passes.arithmetic import ZERO, add, multiply
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.guarded import guarded
 from bayesmc.passes.logarithms import stable
@@ -100,22 +102,44 @@ def unconstrained_density(
     kept = [e for e, t in zip(used, terms, strict=False) if t.name not in inside]
     kept += used[len(terms) :]
     root = _total([*sums_of(kept), *(table.total for table in tables)])
-    for name in sorted(root.leaves & set(finite)):
+    bounds = frozenset().union(*(b.leaves for node in nodes for b in node.bounds))
+    for name in sorted((root.leaves | bounds) & set(finite)):
         raise UnsupportedError(
             f"node {name!r} is to be summed out, and the bounds of a continuous node depend on it; use Gibbs"
         )
     once = _on_one_leaf(nodes, parts)
     slopes = _slopes(root, list(zip(terms, used, strict=False)), list(parts.values()), once)
-    density = UnconstrainedDensity(target, nodes, once(root), slopes, tuple(finite))
+    tables = [table.mapped(lambda e: once(guarded([e])[0])) for table in tables]
+    volume = once(_total(used[len(terms) :]))
+    density = UnconstrainedDensity(
+        target, nodes, once(root), slopes, tuple(finite), volume, tuple(tables)
+    )
     plain = [once(e) for e in guarded([*plain, *volumes.values()])]
     hold_against_model(
         density,
         terms,
         plain,
         [once(e) for e in guarded(used)],
-        [table.mapped(lambda e: once(guarded([e])[0])) for table in tables],
+        tables,
     )
     return density
+
+
+def without_volume(density: UnconstrainedDensity) -> UnconstrainedDensity:
+    """The same log density by the nodes' own coordinates, still as a function of free numbers.
+
+    Where it is largest is the mode that is meant without mention of any map.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    root = add(density.root, multiply(as_expression(-1.0), density.volume))
+    try:
+        slopes = stable([gradient(root, [FREE])[FREE]])[0]
+    except TraceError as error:
+        raise UnsupportedError(str(error)) from error
+    return replace(density, root=root, slopes=slopes, volume=ZERO)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -59,8 +59,10 @@ class Approximation(Protocol):
         In which coordinates the approximation was made, in words, for ``explain`` and ``check``.
     """
 
-    names: tuple[str, ...]
-    coordinates: str
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def coordinates(self) -> str: ...
 
     def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
         """Independent joint draws of all nodes in ``names``."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -115,6 +116,13 @@ class Check:
             )
         return "\n".join([*lines, *self._moved()])
 
+    @cached_property
+    def _unweighted(self) -> DrawsPosterior:
+        own = self.posterior
+        return DrawsPosterior(
+            own._live("check"), own.engine, own._stored, own._shape, independent=True
+        )
+
     def _moved(self) -> list[str]:
         """The scalars whose means moved most, in standard deviations."""
         rows = []
@@ -122,8 +130,11 @@ class Check:
             node = self.posterior.model[name]
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
                 continue
-            plain, found = (p.mean(name).ravel() for p in (self.approximate, self.posterior))
-            before, after = (p.std(name).ravel() for p in (self.approximate, self.posterior))
+            # of what draws answer the same draws without weights: what moves is no chance
+            closed = self.approximate.approximation.marginal(name) is not None
+            before_weights = self.approximate if closed else self._unweighted
+            plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
+            before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
             error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
             with np.errstate(all="ignore"):
                 moved = np.where(after > 0, (found - plain) / after, 0.0)
