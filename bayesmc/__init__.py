@@ -64,6 +64,7 @@ from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.engines.switching.propagation import ExpectationPropagation
+from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
@@ -121,6 +122,7 @@ __all__ = [
     "LikelihoodWeighting",
     "LogNormal",
     "Marginal",
+    "MeanField",
     "MetropolisHastings",
     "Mixture",
     "Multinomial",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -45,7 +45,7 @@ class Ascent:
     memory: list[object]
     bounds: list[float] = field(default_factory=list)
     converged: bool = False
-    figures: list[np.ndarray] = field(default_factory=list)
+    figures: list[np.ndarray] | None = None
 
     def sweep(self) -> float:
         """Improve every factor once; how far the figure that moved most has moved."""
@@ -59,7 +59,7 @@ class Ascent:
         with np.errstate(all="ignore"):
             figures = [f for factor in plan.factors for f in factor.spreads(state)]
         moved = np.inf
-        if self.figures:
+        if self.figures is not None:
             moved = max(
                 (_moved(a, b) for a, b in zip(self.figures, figures, strict=True)), default=0.0
             )
@@ -77,7 +77,7 @@ class Ascent:
             if gain <= tolerance * size and moved <= _FIGURES * tolerance:
                 self.converged = True
                 return
-            if gain < near * size:
+            if near and gain < near * size:
                 return
 
 
@@ -112,13 +112,19 @@ def ascents(plan: Plan, restarts: int, rng: np.random.Generator) -> Iterator[Asc
 
 
 def best_of(
-    plan: Plan, restarts: int, sweeps: int, tolerance: float, rng: np.random.Generator
+    plan: Plan,
+    restarts: int,
+    sweeps: int,
+    tolerance: float,
+    rng: np.random.Generator,
+    told: Callable[[int], object] = id,
 ) -> list[Ascent]:
     """All starts, the best first; it has settled, or used up its sweeps."""
     found = []
     for ascent in ascents(plan, restarts, rng):
         ascent.climb(min(_FIRST, sweeps), tolerance, _NEAR)
         found.append(_stored(plan, ascent))
+        told(1)
     found.sort(key=lambda a: -a.bounds[-1])
     best, rest = found[:_KEPT], found[_KEPT:]
     for ascent in best:
@@ -153,7 +159,7 @@ def started(plan: Plan, values: Values, k: int, rng: np.random.Generator) -> Asc
 
 def _seeded(factor: TableFactor, table: np.ndarray, k: int, rng: np.random.Generator) -> np.ndarray:
     size, count = factor.size, int(np.prod(factor.shape[1:], dtype=int))
-    if count < 2 * size:
+    if count < 2 * size or factor.one_by_one:
         found = rng.dirichlet(np.ones(size), count).T.reshape(factor.shape)
     else:
         each = (1, max(1, count // (4 * size)), 3)[k % 3]

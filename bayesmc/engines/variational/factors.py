@@ -289,9 +289,16 @@ class TableFactor(Factor):
     """Finite nodes that are independent, element by element: tables of probabilities, states first."""
 
     def __init__(
-        self, name: str, size: int, shape: tuple[int, ...], seen: np.ndarray | None
+        self,
+        name: str,
+        size: int,
+        shape: tuple[int, ...],
+        seen: np.ndarray | None,
+        one_by_one: bool = False,
     ) -> None:
         self.names, self.seen, self.size = (name,), seen, size
+        #: elements meet in a term, so that they are updated in turn
+        self.one_by_one, self.elements = one_by_one, math.prod(shape)
         self.table = moment(name, "table")
         self.moments = (self.table,)
         self.shape = (size, *shape)
@@ -315,6 +322,18 @@ class TableFactor(Factor):
             self._entropy = float(inner[~self.seen].sum())
             table = np.where(self.seen, state[self.table], table)
         state[self.table] = table
+
+    def update_one(self, state: State, slopes: Mapping[str, np.ndarray], element: int) -> None:
+        """The same for one element alone."""
+        if self.seen is not None and self.seen.reshape(-1)[element]:
+            return
+        logs = slopes[self.table].reshape(self.size, -1)[:, element]
+        flat = state[self.table].reshape(self.size, -1).copy()
+        column = np.exp(logs - logs.max())
+        flat[:, element] = column / column.sum()
+        state[self.table] = table = flat.reshape(self.shape)
+        hidden = table if self.seen is None else table[:, ~self.seen]
+        self._entropy = float(special.entr(hidden).sum())
 
     def entropy(self, state: State) -> float:
         return self._entropy

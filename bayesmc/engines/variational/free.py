@@ -1,8 +1,8 @@
 """The factor of nodes without closed forms: normal in unconstrained coordinates, all of them jointly.
 
 Its expectations are sums over fixed points that have a normal's mean and covariance exactly, so that the
-bound is a function without noise, which is climbed by quasi-Newton steps and never falls (Giordano, Ingram and
-Broderick 2024). Up to two numbers the points are those of Gauss and Hermite; of more, of a Sobol sequence.
+bound is a function without noise, which is climbed by quasi-Newton steps and never falls (Giordano, Ingram
+and Broderick 2024). Up to two numbers the points are those of Gauss and Hermite, of more a Sobol sequence.
 
 References
 ----------
@@ -117,6 +117,10 @@ class FreeFactor(Factor):
         """The expected logarithm of the change of volume."""
         return self.average(self._volume(state)[0])
 
+    def log_volumes(self, u: np.ndarray) -> np.ndarray:
+        """The logarithm of the change of volume at free numbers."""
+        return self._volume({FREE: u})[0]
+
     def average(self, values: np.ndarray) -> float:
         """An expectation, from values at the points."""
         return float(self.weights @ np.broadcast_to(values, self.weights.shape))
@@ -206,28 +210,42 @@ def rule(size: int, is_full: bool) -> tuple[np.ndarray, np.ndarray]:
     (True, True)
     """
     if size in _HERMITE:
-        nodes, weights = special.roots_hermitenorm(_HERMITE[size])
-        weights = weights / weights.sum()
-        grid = np.stack(np.meshgrid(*[nodes] * size, indexing="ij"), axis=-1).reshape(-1, size)
-        product = np.prod(np.stack(np.meshgrid(*[weights] * size)), axis=0).reshape(-1)
-        kept = product > 1e-14
-        return grid[kept], product[kept] / product[kept].sum()
+        return _hermite(size, _HERMITE[size])
     half = 1 << max(6, math.ceil(math.log2(6 * size))) if is_full else 32
-    return standard_points(size, half, is_full, seed=0)
-
-
-def standard_points(
-    size: int, half: int, is_full: bool, seed: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of opposite points of a scrambled Sobol sequence, with their second moments put right."""
-    from scipy.stats import qmc  # heavy: loaded where it is used
-
-    uniform = qmc.Sobol(size, rng=np.random.default_rng(seed)).random(half)
-    some = special.ndtri(np.clip(uniform, 1e-12, 1 - 1e-12))
-    z = np.concatenate([some, -some])
+    z, weights = fresh_points(size, np.random.default_rng(0), half)
     if is_full:
         root = np.linalg.cholesky(z.T @ z / len(z))
         z = np.linalg.solve(root, z.T).T
     else:
         z = z / np.sqrt((z**2).mean(axis=0))
-    return z, np.full(len(z), 1.0 / len(z))
+    return z, weights
+
+
+def finer_rule(size: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """More points of the rule of Gauss and Hermite, where it is used."""
+    return _hermite(size, 3 * _HERMITE[size] // 2) if size in _HERMITE else None
+
+
+def fresh_points(
+    size: int, rng: np.random.Generator, half: int = 256
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs of opposite points of a scrambled Sobol sequence, made normal, with their weights."""
+    from scipy.stats import qmc  # heavy: loaded where it is used
+
+    uniform = qmc.Sobol(size, rng=rng).random(half)
+    some = special.ndtri(np.clip(uniform, 1e-12, 1 - 1e-12))
+    return np.concatenate([some, -some]), np.full(2 * half, 0.5 / half)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _hermite(size: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The product rule of Gauss and Hermite without points of next to no weight."""
+    nodes, weights = special.roots_hermitenorm(count)
+    weights = weights / weights.sum()
+    grid = np.stack(np.meshgrid(*[nodes] * size, indexing="ij"), axis=-1).reshape(-1, size)
+    each = np.stack(np.meshgrid(*[weights] * size, indexing="ij"), axis=-1).reshape(-1, size)
+    product = each.prod(axis=-1)
+    kept = product > 1e-14
+    return grid[kept], product[kept] / product[kept].sum()

@@ -65,6 +65,18 @@ class Plan:
     def update(self, k: int, state: State) -> None:
         """Make a factor the best given all others."""
         factor = self.factors[k]
+        _, _, by_label = self._steps[k]
+        if isinstance(factor, TableFactor) and factor.one_by_one:
+            for element in range(factor.elements):
+                factor.update_one(state, self._slopes(k, state), element)
+        else:
+            factor.update(state, self._slopes(k, state))
+        if by_label:
+            self.add_up(state, by_label)
+
+    def _slopes(self, k: int, state: State) -> State:
+        """Derivatives of the expected log joint density by a factor's moments."""
+        factor = self.factors[k]
         program, names, by_label = self._steps[k]
         slopes = {name: np.zeros(0) for name in factor.moments}
         if program is not None and not isinstance(factor, FreeFactor):
@@ -81,9 +93,7 @@ class Plan:
             found = table @ label.statistics
             name = factor.moments[0]
             slopes[name] = slopes[name] + found.reshape(slopes[name].shape)
-        factor.update(state, slopes)
-        if by_label:
-            self.add_up(state, by_label)
+        return slopes
 
     def add_up(self, state: State, by_label: Sequence[tuple[LabelTerm, Any]]) -> None:
         """Sums of statistics under new tables."""
@@ -103,9 +113,13 @@ class Plan:
 
     def energy(self, state: State) -> float:
         """The expected log joint density."""
-        (found,) = self._energy(state)  # type: ignore[attr-defined]
-        found = np.asarray(found)
+        found = self.values(state)
         return self.free.average(found) if self.free is not None else float(found)
+
+    def values(self, state: State) -> np.ndarray:
+        """The same at every point of the free numbers."""
+        (found,) = self._energy(state)  # type: ignore[attr-defined]
+        return np.asarray(found)
 
     def shapes(self, factor: Factor) -> list[tuple[str, tuple[int, ...]]]:
         return [] if isinstance(factor, FreeFactor) else self._shapes[factor.names]  # type: ignore[attr-defined]
@@ -283,7 +297,7 @@ class _Chooser:
         factors = self._factors(hidden, leaves)
         if free is not None:
             factors.append(free)
-        factors += [self._table(n) for n in self.tables]
+        factors += [self._table(n, n in reader.meeting) for n in self.tables]
         try:
             plan = Plan(target, tuple(factors), tuple(sums), free, self._why(factors))
         except TraceError as error:
@@ -320,11 +334,11 @@ class _Chooser:
                 found.append(ShareFactor(own, mask))
         return found
 
-    def _table(self, name: str) -> TableFactor:
+    def _table(self, name: str, meeting: bool) -> TableFactor:
         node, seen = self.target.model[name], self.target.seen(name)
         mask = None if seen is None else np.broadcast_to(seen.mask, node.plate_shape)  # type: ignore
         assert node.domain is not None
-        return TableFactor(name, node.domain.size, node.plate_shape, mask)
+        return TableFactor(name, node.domain.size, node.plate_shape, mask, meeting)
 
     def _plates(self, name: str) -> tuple[int, ...]:
         return self.target.model[name].plate_shape
@@ -377,9 +391,7 @@ def hold_at_points(plan: Plan) -> None:
     if target.states is None:
         return
     for row in (0, -1):
-        values = {
-            n: v if target.is_known(n) else v[row][None] for n, v in target.states.items()
-        }
+        values = {n: v if target.is_known(n) else v[row][None] for n, v in target.states.items()}
         for name in target.chain:
             seen = target.seen(name)
             if seen is not None:

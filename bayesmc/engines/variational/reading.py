@@ -54,6 +54,8 @@ from bayesmc.structure.target import Target, Term
 
 #: entries of one term at all joint states of its finite nodes
 _MOST = 1 << 23
+#: joint states of all elements of one node
+_JOINTLY = 1 << 12
 #: axes of one value of each parameter, of families that are taken apart
 _NDIM: dict[Any, Mapping[str, int]] = {
     Normal: {"loc": 0, "scale": 0},
@@ -125,6 +127,8 @@ class TermReader:
         above: Mapping[str, Expression],
     ) -> None:
         self.target, self.hidden, self.tables, self.above = target, hidden, tables, above
+        #: finite nodes several of whose elements meet in an entry
+        self.meeting: set[str] = set()
 
     def __call__(self, term: Term) -> Sum:
         """The expectation of a term.
@@ -145,11 +149,10 @@ class TermReader:
         given = self._given(term, whole)
         whole = substituted(whole, given)
         finite = sorted(whole.leaves & set(self.tables))
+        self._read_elements(term, whole, finite)
         if term.is_potential:
-            return Sum(
-                term.name,
-                self._summed(term, self._of_expression(term, whole, finite), finite, whole),
-            )
+            log = self._of_expression(term, whole, finite)
+            return Sum(term.name, self._summed(term, log, finite))
         assert not isinstance(term.read, Opaque)
         read = term.read.result
         family = read if isinstance(read, Family) else family_of(read)
@@ -172,7 +175,7 @@ class TermReader:
         else:
             base = broadcast(plain_density(family, value), term.shape)
             log = self._of_expression(term, base, finite)
-        return Sum(term.name, self._summed(term, log, finite, whole))
+        return Sum(term.name, self._summed(term, log, finite))
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -202,56 +205,83 @@ class TermReader:
         return self._expectation(term)(widened(base, grid, count) if finite else base)
 
     def _grid(self, finite: Sequence[str]) -> tuple[dict[str, Expression], int]:
-        """Every joint state of finite nodes, the same for all elements."""
-        sizes = [self.tables[n] for n in finite]
-        count = math.prod(sizes)
-        grid = {}
-        for name, states in zip(finite, self._states(finite), strict=True):
+        """Every joint state of finite nodes: the same for all elements, or of all elements."""
+        states = self._states(finite)
+        grid: dict[str, Expression] = {}
+        for name, own in zip(finite, states, strict=True):
             shape = self.target.model[name].value_shape
-            if count * math.prod(shape) > _MOST:
-                raise UnsupportedError(f"{count} joint states of {', '.join(finite)}: too many")
-            whole = states.reshape((-1,) + (1,) * len(shape))
-            grid[name] = constant(np.broadcast_to(whole, (count, *shape)))
-        return grid, count
+            if own.shape[1] == 1:
+                own = np.broadcast_to(own, (len(own), math.prod(shape)))
+            grid[name] = constant(own.reshape(-1, *shape))
+        return grid, len(states[0]) if states else 1
 
     def _states(self, finite: Sequence[str]) -> list[np.ndarray]:
-        sizes = [self.tables[n] for n in finite]
-        return [g.reshape(-1) for g in np.meshgrid(*map(np.arange, sizes), indexing="ij")]
+        """Of each node its states in all joint ones, ``(count, 1)``, or those of all its elements."""
+        each = []
+        for name in finite:
+            states = np.arange(self.tables[name])
+            size = math.prod(self.target.model[name].value_shape)
+            if self._at[name] is not None:
+                each.append(states[:, None])
+                continue
+            if len(states) ** size > _JOINTLY:
+                raise UnsupportedError(
+                    f"MeanField: entries of a term read several elements of finite node {name!r}, which have "
+                    f"{len(states)}**{size} joint states; use Gibbs()"
+                )
+            every = np.stack(np.meshgrid(*[states] * size, indexing="ij"), axis=-1)
+            each.append(every.reshape(-1, size))
+        if math.prod(map(len, each)) > _MOST:
+            raise UnsupportedError(
+                f"MeanField: {', '.join(map(repr, finite))} meet in one term and have too many joint "
+                "states; use Gibbs()"
+            )
+        at = np.meshgrid(*(np.arange(len(e)) for e in each), indexing="ij")
+        return [e[a.reshape(-1)] for e, a in zip(each, at, strict=True)]
 
-    def _summed(
-        self, term: Term, log: Expression, finite: Sequence[str], whole: Expression
-    ) -> Expression:
+    def _read_elements(self, term: Term, whole: Expression, finite: Sequence[str]) -> None:
+        """Which element of each finite node an entry reads; None where several, or if others tell which."""
+        self._at: dict[str, np.ndarray | None] = {}
+        for name in finite:
+            shape = self.target.model[name].value_shape
+            try:
+                at = element_read(whole, name, np.arange(math.prod(shape)).reshape(shape))
+            except TraceError:
+                at = None
+            if math.prod(shape) == 1:
+                self._at[name] = np.zeros(term.shape, int)
+            elif isinstance(at, Constant):
+                self._at[name] = np.maximum(np.broadcast_to(at.value, term.shape), 0)
+            else:
+                self._at[name] = None
+                self.meeting.add(name)
+
+    def _summed(self, term: Term, log: Expression, finite: Sequence[str]) -> Expression:
         """A log factor summed over its elements, weighted by the tables of finite nodes."""
-        shape = (math.prod(self.tables[n] for n in finite), *term.shape) if finite else term.shape
+        states = self._states(finite)
+        shape = (len(states[0]), *term.shape) if finite else term.shape
         if math.prod(shape) > _MOST:
             raise UnsupportedError(
                 f"MeanField: term {term.name!r} has {math.prod(shape)} entries at all joint states of "
-                f"{', '.join(map(repr, finite))}"
+                f"{', '.join(map(repr, finite))}; use Gibbs()"
             )
         log = _possible(broadcast(log, shape))
         if term.mask is not None:
             log = tidy(np.where, np.broadcast_to(term.mask, term.shape), log, 0.0)
-        for name, states in zip(finite, self._states(finite), strict=True):
-            log = multiply(log, self._weights(term, name, states, whole))
-        return reduction(np.add, log, range(len(log.shape)))
+        for name, own in zip(finite, states, strict=True):
+            log = multiply(log, self._weights(name, own, len(term.shape)))
+        return reduction(np.add, broadcast(log, shape), range(len(shape)))
 
-    def _weights(self, term: Term, name: str, states: np.ndarray, whole: Expression) -> Expression:
-        node = self.target.model[name]
-        own = leaf(moment(name, "table"), (self.tables[name], *node.value_shape))
-        size = math.prod(node.value_shape)
-        try:
-            at = element_read(whole, name, np.arange(size).reshape(node.value_shape))
-        except TraceError as error:
-            raise UnsupportedError(
-                f"MeanField: an entry of {term.name!r} reads several elements of {name!r}: {error}"
-            ) from error
-        if not isinstance(at, Constant):
-            raise UnsupportedError(
-                f"MeanField: which element of finite node {name!r} {term.name!r} reads hangs on other nodes"
-            )
-        place = np.maximum(np.broadcast_to(at.value, term.shape), 0)
-        rows = states.reshape((-1,) + (1,) * place.ndim) * size
-        return pick([own], rows + place)
+    def _weights(self, name: str, states: np.ndarray, rank: int) -> Expression:
+        """The probability of each joint state for each entry."""
+        shape = self.target.model[name].value_shape
+        size, at = math.prod(shape), self._at[name]
+        own = leaf(moment(name, "table"), (self.tables[name], *shape))
+        if at is not None:
+            rows = states.reshape((-1,) + (1,) * at.ndim) * size
+            return pick([own], rows + at)
+        each = pick([own], states * size + np.arange(size))
+        return reshape(reduction(np.multiply, each, (1,)), (len(states),) + (1,) * rank)
 
     # ---- labels ------------------------------------------------------------------------------------
 
