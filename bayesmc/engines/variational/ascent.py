@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.engines.variational.factors import State, TableFactor
-from bayesmc.engines.variational.plan import Plan
+from bayesmc.engines.variational.steps import Plan
 from bayesmc.errors import BayesmcError
 from bayesmc.structure.target import Values
 
@@ -45,38 +45,34 @@ class Ascent:
     memory: list[object]
     bounds: list[float] = field(default_factory=list)
     converged: bool = False
-    figures: list[np.ndarray] | None = None
 
     def sweep(self) -> float:
-        """Improve every factor once; how far the figure that moved most has moved."""
-        plan, state = self.plan, self.state
-        for k in range(len(plan.factors)):
-            plan.update(k, state)
-        bound = plan.bound(state)
+        """Improve every factor once; how much the bound has gained."""
+        for step in self.plan.steps:
+            step.update(self.state)
+        bound = self.plan.bound(self.state)
+        gain = np.inf
         if self.bounds:
             check_bound(self.bounds[-1], bound)
+            gain = bound - self.bounds[-1]
         self.bounds.append(bound)
-        with np.errstate(all="ignore"):
-            figures = [f for factor in plan.factors for f in factor.spreads(state)]
-        moved = np.inf
-        if self.figures is not None:
-            moved = max(
-                (_moved(a, b) for a, b in zip(self.figures, figures, strict=True)), default=0.0
-            )
-        self.figures = figures
-        return moved
+        return gain
 
     def climb(self, sweeps: int, tolerance: float, near: float = 0.0) -> None:
         """Sweep until it has settled, or the gain is below a share of the bound."""
+        before = None
         for _ in range(sweeps):
-            moved = self.sweep()
-            if len(self.bounds) < 2:
-                continue
-            gain = self.bounds[-1] - self.bounds[-2]
+            gain = self.sweep()
             size = 1.0 + abs(self.bounds[-1])
-            if gain <= tolerance * size and moved <= _FIGURES * tolerance:
-                self.converged = True
-                return
+            if gain <= tolerance * size:  # only then is it worth to look how far figures move
+                with np.errstate(all="ignore"):
+                    now = [f for factor in self.plan.factors for f in factor.spreads(self.state)]
+                if before is not None and _moved(before, now) <= _FIGURES * tolerance:
+                    self.converged = True
+                    return
+                before = now
+            else:
+                before = None
             if near and gain < near * size:
                 return
 
@@ -147,10 +143,11 @@ def started(plan: Plan, values: Values, k: int, rng: np.random.Generator) -> Asc
     target = plan.target
     own = {n: v if target.is_known(n) else v[k] for n, v in values.items()}
     plan.start(state, own)
-    for place, factor in enumerate(plan.factors):
+    for step in plan.steps:
+        factor = step.factor
         if isinstance(factor, TableFactor):
             state[factor.table] = _seeded(factor, state[factor.table], k, rng)
-            plan.add_up(state, plan._steps[place][2])
+            step.tell(state)
     return Ascent(plan, state, [])
 
 
@@ -170,10 +167,16 @@ def _seeded(factor: TableFactor, table: np.ndarray, k: int, rng: np.random.Gener
     return found if factor.seen is None else np.where(factor.seen, table, found)
 
 
-def _moved(before: np.ndarray, now: np.ndarray) -> float:
+def _moved(before: Sequence[np.ndarray], now: Sequence[np.ndarray]) -> float:
+    """How far the figure that moved most has moved."""
     with np.errstate(invalid="ignore"):
-        off = np.abs(now - before)
-    return float(np.nanmax(off, initial=0.0))
+        return max(
+            (
+                float(np.nanmax(np.abs(b - a), initial=0.0))
+                for a, b in zip(before, now, strict=True)
+            ),
+            default=0.0,
+        )
 
 
 def _stored(plan: Plan, ascent: Ascent) -> Ascent:

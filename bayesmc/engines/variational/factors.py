@@ -36,12 +36,15 @@ class Factor(ABC):
         Its nodes.
     moments : tuple of str
         The leaves that stand for its expectations.
+    shapes : dict
+        Of these.
     seen : ndarray of bool or None
         Elements whose values are known.
     """
 
     names: tuple[str, ...]
     moments: tuple[str, ...]
+    shapes: dict[str, tuple[int, ...]]
     seen: np.ndarray | None
 
     @abstractmethod
@@ -68,6 +71,7 @@ class NormalFactor(Factor):
         self.own, self.names = own, (own.name,)
         self.mean, self.cov = moment(own.name, "mean"), moment(own.name, "cov")
         self.moments = (self.mean, self.cov)
+        self.shapes = {self.mean: own.shape, self.cov: own.moment("cov").shape}
         self.seen = None if seen is None else np.broadcast_to(_expanded(seen, own.shape), own.shape)
         self._entropy = 0.0
 
@@ -159,9 +163,11 @@ class ScatterFactor(Factor):
         self.precision = moment(own.name, "inv" if is_inverse else "x")
         self.log = moment(own.name, "log")
         self.moments: tuple[str, ...] = (self.precision, self.log)
+        self.shapes = {self.precision: own.shape, self.log: own.moment("log").shape}
         if mean is not None:
             self.mean, self.spread = moment(mean.name, "mean"), moment(mean.name, "spread")
             self.moments += (self.mean, self.spread)
+            self.shapes |= {self.mean: mean.shape, self.spread: mean.moment("spread").shape}
         inner = 2 if own.kind == "matrix" else 0
         self.plates = own.shape[: len(own.shape) - inner]
         #: degrees of freedom and inverse scales of the precisions; how many observations a mean is worth
@@ -182,40 +188,31 @@ class ScatterFactor(Factor):
             state[self.spread] = np.zeros(self.plates)
 
     def update(self, state: State, slopes: Mapping[str, np.ndarray]) -> None:
-        d, shape = self.size, (*self.plates, self.size, self.size)
-        own = -2.0 * slopes[self.precision].reshape(shape)
-        logs = slopes[self.log] * (-1.0 if self.is_inverse else 1.0)
-        df = 2.0 * logs + (-(d + 1) if self.is_inverse else d + 1)
+        d = self.size
+        own = (-2.0 * slopes[self.precision]).reshape((*self.plates, d, d))
+        df = (-2.0 if self.is_inverse else 2.0) * slopes[self.log]
+        df = df - (d + 1.0) if self.is_inverse else df + (d + 1.0)
         if self.location is not None:
             df = df - 1.0
-            count = -2.0 * slopes[self.spread] / d
-            mean, step = state[self.mean], slopes[self.mean].reshape((*self.plates, d))
-            old = np.reshape(state[self.precision], shape)
-            with np.errstate(all="ignore"):
-                moved = np.linalg.solve(old, step[..., None])[..., 0] / count[..., None]
-            own = own - count[..., None, None] * moved[..., :, None] * moved[..., None, :]
-            state[self.mean] = mean + moved.reshape(mean.shape)
-            state[self.spread] = 1.0 / count
-            self.count = count
-            if not (count > 0).all():
-                raise improper(self.location.name)
-        self.df, self.inverse_scale = df, 0.5 * (own + own.swapaxes(-1, -2))
-        free = np.ones(self.plates, bool) if self.seen is None else ~self.seen
+            own = own - self._moved(state, slopes)
+        own = 0.5 * (own + own.swapaxes(-1, -2))
+        if self.seen is not None:  # what was seen keeps its moments; any proper values do here
+            own = np.where(self.seen[..., None, None], np.eye(d), own)
+            df = np.where(self.seen, d + 1.0, df)
         try:
-            root = np.linalg.cholesky(
-                np.where(free[..., None, None], self.inverse_scale, np.eye(d))
-            )
+            root = np.linalg.cholesky(own)
         except np.linalg.LinAlgError:
             raise improper(self.own.name) from None
-        if not (df[free] > d - 1).all():
+        if not (df > d - 1).all():
             raise improper(self.own.name)
-        safe = np.where(free, df, d + 1.0)
+        self.df, self.inverse_scale = df, own
         self._log_det = 2.0 * np.log(np.linalg.diagonal(root)).sum(axis=-1)
-        halves = 0.5 * (safe[..., None] - np.arange(d))
-        log = special.digamma(halves).sum(axis=-1) + d * math.log(2.0) - self._log_det
-        expected = safe[..., None, None] * np.linalg.inv(np.where(
-            free[..., None, None], self.inverse_scale, np.eye(d)))  # fmt: skip
-        expected = 0.5 * (expected + expected.swapaxes(-1, -2)).reshape(self.own.shape)
+        halves = 0.5 * (df[..., None] - np.arange(d))
+        log = special.digamma(halves).sum(axis=-1) + (d * math.log(2.0) - self._log_det)
+        self._log, self._norm = log, special.gammaln(halves).sum(axis=-1)
+        expected = np.linalg.inv(own)
+        expected = (0.5 * df[..., None, None]) * (expected + expected.swapaxes(-1, -2))
+        expected = expected.reshape(self.own.shape)
         log = -log if self.is_inverse else log
         if self.seen is not None:
             wide = _expanded(self.seen, self.own.shape)
@@ -223,17 +220,29 @@ class ScatterFactor(Factor):
             log = np.where(self.seen, state[self.log], log)
         state[self.precision], state[self.log] = expected, log
 
+    def _moved(self, state: State, slopes: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Update the mean; what its step takes from the inverse scale."""
+        assert self.location is not None
+        d = self.size
+        self.count = count = (-2.0 / d) * slopes[self.spread]
+        if not (count > 0).all():
+            raise improper(self.location.name)
+        step = slopes[self.mean].reshape((*self.plates, d, 1))
+        old = state[self.precision].reshape((*self.plates, d, d))
+        moved = np.linalg.solve(old, step) / count[..., None, None]
+        state[self.mean] = state[self.mean] + moved.reshape(self.location.shape)
+        state[self.spread] = 1.0 / count
+        return (count[..., None, None] * moved) * moved.swapaxes(-1, -2)
+
     def entropy(self, state: State) -> float:
-        d, df = self.size, self.df
-        free = np.ones(self.plates, bool) if self.seen is None else ~self.seen
-        df = np.where(free, df, d + 1.0)
-        log = state[self.log] * (-1.0 if self.is_inverse else 1.0)  # of the precision
-        norm = 0.5 * df * d * math.log(2.0) + _log_gamma(0.5 * df, d)
+        d, df, log = self.size, self.df, self._log
+        norm = (0.5 * d * math.log(2.0)) * df + self._norm
+        norm = norm + 0.25 * d * (d - 1) * math.log(math.pi)
         power = 0.5 * (df + d + 1) if self.is_inverse else 0.5 * (df - d - 1)
-        found = norm - 0.5 * df * self._log_det - power * log + 0.5 * df * d
+        found = norm + (0.5 * df) * (d - self._log_det) - power * log
         if self.location is not None:
             found = found + 0.5 * (d * (1.0 + _LOG_2PI) - d * np.log(self.count) - log)
-        return float(found[free].sum())
+        return float((found if self.seen is None else found[~self.seen]).sum())
 
     def spreads(self, state: State) -> list[np.ndarray]:
         found = [np.log(self.df), self._log_det]
@@ -251,6 +260,7 @@ class ShareFactor(Factor):
         self.own, self.names, self.seen = own, (own.name,), seen
         logs = ("log",) if own.kind == "simplex" else ("log", "log1m")
         self.moments = tuple(moment(own.name, f) for f in logs)
+        self.shapes = dict.fromkeys(self.moments, own.shape)
         self.concentration = np.zeros(0)
 
     def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
@@ -286,7 +296,10 @@ class ShareFactor(Factor):
 
 
 class TableFactor(Factor):
-    """Finite nodes that are independent, element by element: tables of probabilities, states first."""
+    """Finite nodes that are independent, element by element: tables of probabilities, states first.
+
+    Tables, and the derivatives that they come from, are written over.
+    """
 
     def __init__(
         self,
@@ -302,6 +315,7 @@ class TableFactor(Factor):
         self.table = moment(name, "table")
         self.moments = (self.table,)
         self.shape = (size, *shape)
+        self.shapes = {self.table: self.shape}
         self._entropy = 0.0
 
     def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
@@ -309,10 +323,10 @@ class TableFactor(Factor):
         state[self.table] = (np.asarray(values[self.names[0]]) == states).astype(float)
 
     def update(self, state: State, slopes: Mapping[str, np.ndarray]) -> None:
-        logs = slopes[self.table]
-        top = logs.max(axis=0)
-        logs = logs - top
-        table = np.exp(logs)
+        logs, old = slopes[self.table], state[self.table]
+        logs -= logs.max(axis=0)
+        fresh = self.seen is not None or old.shape != logs.shape
+        table = np.exp(logs, out=None if fresh else old)  # large: memory is used again
         total = table.sum(axis=0)
         table /= total
         if self.seen is None:
@@ -320,7 +334,7 @@ class TableFactor(Factor):
         else:
             inner = np.log(total) - (table * logs).sum(axis=0)
             self._entropy = float(inner[~self.seen].sum())
-            table = np.where(self.seen, state[self.table], table)
+            table = np.where(self.seen, old, table)
         state[self.table] = table
 
     def update_one(self, state: State, slopes: Mapping[str, np.ndarray], element: int) -> None:
@@ -339,7 +353,7 @@ class TableFactor(Factor):
         return self._entropy
 
     def spreads(self, state: State) -> list[np.ndarray]:
-        return [state[self.table]]
+        return [state[self.table].copy()]
 
 
 def improper(name: str) -> UnsupportedError:
@@ -351,12 +365,6 @@ def improper(name: str) -> UnsupportedError:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _log_gamma(a: np.ndarray, d: int) -> np.ndarray:
-    """The log of the multivariate gamma function."""
-    halves = a[..., None] - 0.5 * np.arange(d)
-    return 0.25 * d * (d - 1) * math.log(math.pi) + special.gammaln(halves).sum(axis=-1)
 
 
 def _expanded(seen: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -67,6 +67,7 @@ class FreeFactor(Factor):
         self.is_full = self.size <= FULL
         self.leaf: Leaf = leaf(FREE, (self.size,))
         self.moments = (FREE,)
+        self.shapes = {FREE: (self.size,)}
         self.above: dict[str, Expression] = {}
         total: Expression = ZERO
         for node in found:

@@ -16,7 +16,8 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
-from bayesmc.engines.variational.plan import Plan, plan_for
+from bayesmc.engines.variational.plan import plan_for
+from bayesmc.engines.variational.steps import Plan
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import ConvergenceWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Problem

@@ -1,11 +1,9 @@
-"""Which factor each hidden node has, and the programs of a sweep."""
+"""Which factor each hidden node has: closed forms where there are any."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -18,12 +16,9 @@ from bayesmc.engines.variational.factors import (
     TableFactor,
 )
 from bayesmc.engines.variational.free import FREE, FreeFactor
-from bayesmc.engines.variational.reading import LabelTerm, Sum, TermReader, has_moments
+from bayesmc.engines.variational.reading import TermReader, has_moments
+from bayesmc.engines.variational.steps import Plan
 from bayesmc.errors import TraceError, UnsupportedError
-from bayesmc.expression import Expression, Program
-from bayesmc.passes.arithmetic import ZERO, add
-from bayesmc.passes.arrays import for_arrays
-from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.moments import Hidden, Meeting, NoMoment, moment
 from bayesmc.structure.target import Target
 
@@ -31,139 +26,6 @@ from bayesmc.structure.target import Target
 _JOINT = 400
 #: relative error that the energy of points may have
 _ROUNDING = 1e-8
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """A mean-field approximation, ready to be improved.
-
-    Attributes
-    ----------
-    target : Target
-    factors : tuple of Factor
-        In the order of a sweep: numbers first, then tables.
-    sums : tuple of Sum
-        The terms' expectations.
-    free : FreeFactor or None
-    why : dict
-        Node -> what kind of factor it has, and why no closer one.
-    """
-
-    target: Target
-    factors: tuple[Factor, ...]
-    sums: tuple[Sum, ...]
-    free: FreeFactor | None
-    why: dict[str, str]
-    _steps: dict[int, Any] = field(default_factory=dict, repr=False)
-
-    def __post_init__(self) -> None:
-        self.__dict__["labels"] = [s.by_label for s in self.sums if s.by_label is not None]
-        for k, factor in enumerate(self.factors):
-            self._steps[k] = self._prepared(factor)
-        self.__dict__["_energy"] = Program(for_arrays([_total(s.total for s in self.sums)]))
-
-    def update(self, k: int, state: State) -> None:
-        """Make a factor the best given all others."""
-        factor = self.factors[k]
-        _, _, by_label = self._steps[k]
-        if isinstance(factor, TableFactor) and factor.one_by_one:
-            for element in range(factor.elements):
-                factor.update_one(state, self._slopes(k, state), element)
-        else:
-            factor.update(state, self._slopes(k, state))
-        if by_label:
-            self.add_up(state, by_label)
-
-    def _slopes(self, k: int, state: State) -> State:
-        """Derivatives of the expected log joint density by a factor's moments."""
-        factor = self.factors[k]
-        program, names, by_label = self._steps[k]
-        slopes = {name: np.zeros(0) for name in factor.moments}
-        if program is not None and not isinstance(factor, FreeFactor):
-            for name, value in zip(names, program(state), strict=True):
-                slopes[name] = self._averaged(value, name)
-        for name, shape in self.shapes(factor):
-            if not slopes[name].shape or slopes[name].shape != shape:
-                slopes[name] = (
-                    np.broadcast_to(slopes[name], shape) if slopes[name].size else np.zeros(shape)
-                )
-        for label, coefficients in by_label:
-            (table,) = coefficients(state)
-            table = self._mean(table, 2)
-            found = table @ label.statistics
-            name = factor.moments[0]
-            slopes[name] = slopes[name] + found.reshape(slopes[name].shape)
-        return slopes
-
-    def add_up(self, state: State, by_label: Sequence[tuple[LabelTerm, Any]]) -> None:
-        """Sums of statistics under new tables."""
-        for label, _ in by_label:
-            table = state[moment(label.label, "table")]
-            state[label.sums.name] = table.reshape(len(table), -1) @ label.statistics.T
-
-    def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
-        for k, factor in enumerate(self.factors):
-            factor.start(state, values)
-            self.add_up(state, self._steps[k][2])
-
-    def bound(self, state: State) -> float:
-        """The evidence lower bound, up to factors of what is known."""
-        total = self.energy(state) + sum(f.entropy(state) for f in self.factors)
-        return total if self.free is None else total + self.free.bound_parts(state)
-
-    def energy(self, state: State) -> float:
-        """The expected log joint density."""
-        found = self.values(state)
-        return self.free.average(found) if self.free is not None else float(found)
-
-    def values(self, state: State) -> np.ndarray:
-        """The same at every point of the free numbers."""
-        (found,) = self._energy(state)  # type: ignore[attr-defined]
-        return np.asarray(found)
-
-    def shapes(self, factor: Factor) -> list[tuple[str, tuple[int, ...]]]:
-        return [] if isinstance(factor, FreeFactor) else self._shapes[factor.names]  # type: ignore[attr-defined]
-
-    # ---- private -------------------------------------------------------------------------------
-
-    def _mean(self, value: np.ndarray, rank: int) -> np.ndarray:
-        """Averages over the points of free numbers, where it depends on these."""
-        if np.ndim(value) == rank or self.free is None:
-            return value
-        return np.tensordot(self.free.weights, value, 1)
-
-    def _averaged(self, value: np.ndarray, name: str) -> np.ndarray:
-        value = np.asarray(value)
-        return self._mean(value, len(self._rank[name]))  # type: ignore[attr-defined]
-
-    def _prepared(self, factor: Factor) -> Any:
-        """The program of its slopes, their names, and what labels it says."""
-        ranks = self.__dict__.setdefault("_rank", {})
-        shapes = self.__dict__.setdefault("_shapes", {})
-        if isinstance(factor, FreeFactor):
-            factor.prepare(_total(s.total for s in self.sums if FREE in s.total.leaves))
-            return None, (), ()
-        own = set(factor.moments)
-        is_table = isinstance(factor, TableFactor)
-        used = [
-            s.total
-            for s in self.sums
-            if s.total.leaves & own and not (is_table and s.by_label is not None)
-        ]
-        by_label = [
-            (t, Program(for_arrays([t.coefficients])))
-            for t in self.labels  # type: ignore[attr-defined]
-            if is_table and t.label == factor.names[0]
-        ]
-        slopes = gradient(_total(used), factor.moments) if used else {}
-        names = tuple(slopes)
-        found = []
-        for name, shape in _shapes_of(factor):
-            ranks[name] = shape
-            found.append((name, shape))
-        shapes[factor.names] = found
-        program = Program(for_arrays([slopes[n] for n in names])) if names else None
-        return program, names, by_label
 
 
 def plan_for(target: Target, blocks: Sequence[Sequence[str]]) -> Plan:
@@ -186,21 +48,6 @@ def plan_for(target: Target, blocks: Sequence[Sequence[str]]) -> Plan:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _shapes_of(factor: Factor) -> list[tuple[str, tuple[int, ...]]]:
-    if isinstance(factor, TableFactor):
-        return [(factor.table, factor.shape)]
-    owns = [factor.own]  # type: ignore[attr-defined]
-    if isinstance(factor, ScatterFactor) and factor.location is not None:
-        owns.append(factor.location)
-    known = {
-        moment(o.name, f): o.moment(f).shape
-        for o in owns
-        for f in ("mean", "cov", "spread", "x", "inv", "log", "log1m")
-        if f != "cov" or o.kind == "number"
-    }
-    return [(name, known[name]) for name in factor.moments]
 
 
 class _Chooser:
@@ -300,6 +147,7 @@ class _Chooser:
         factors += [self._table(n, n in reader.meeting) for n in self.tables]
         try:
             plan = Plan(target, tuple(factors), tuple(sums), free, self._why(factors))
+            _ = plan.steps
         except TraceError as error:
             raise UnsupportedError(f"MeanField: {error}") from error
         hold_at_points(plan)
@@ -371,13 +219,6 @@ class _Chooser:
                 )
             return f"closed form: {kind}"
         return f"closed form: {'Dirichlet' if factor.own.kind == 'simplex' else 'beta'}"  # type: ignore
-
-
-def _total(parts: Any) -> Expression:
-    total: Expression = ZERO
-    for part in parts:
-        total = add(total, part)
-    return total
 
 
 def hold_at_points(plan: Plan) -> None:
