@@ -116,7 +116,7 @@ class Expectation:
                 first, second = affine(u, [name]), affine(w, [name])
             except TraceError:
                 continue
-            own = {name: self.hidden[name].moment("mean")}
+            own: dict[str, Expression] = {name: self.hidden[name].moment("mean")}
             total = self.cross(substituted(u, own), substituted(w, own))
             if name in first.reads and name in second.reads:
                 spread = self._spread(self.hidden[name], first.reads[name], second.reads[name])

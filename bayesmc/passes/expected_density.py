@@ -141,7 +141,7 @@ def quadratic_moments(
     precision, logs = factors.expected(of, -1.0), multiply(-1.0, factors.log_det(of))
     mean = broadcast(of(loc), loc.shape)
     linear = TracedArray(precision)
-    b = np.matvec(linear, TracedArray(mean)).expression  # type: ignore[call-overload]
+    b = np.matvec(linear, TracedArray(mean)).expression
     return precision, b, _form(of, loc, factors), logs
 
 
@@ -372,8 +372,8 @@ def _traced(of: Expectation, off: Expression, precision: Expression) -> Expressi
     """``sum_ij precision_ij E[off_i off_j]``."""
     d = off.shape[-1]
     if not of.names(off):
-        inner: Any = np.matvec(TracedArray(precision), TracedArray(off))  # type: ignore[call-overload]
-        return np.vecdot(inner, TracedArray(off)).expression  # type: ignore[call-overload]
+        inner: Any = np.matvec(TracedArray(precision), TracedArray(off))
+        return np.vecdot(inner, TracedArray(off)).expression
     shape = (*off.shape[:-1], d, d)
     one = broadcast(reshape(off, (*off.shape, 1)), shape)
     two = broadcast(reshape(off, (*off.shape[:-1], 1, d)), shape)
@@ -396,7 +396,7 @@ def _matrix(
         own.expected(of, 1.0), given.expected(of, -1.0))  # fmt: skip
     whole = multiply(x, v)
     trace = reduction(np.add, whole, (-2, -1))
-    halves: Any = 0.5 * (np.reshape(TracedArray(df), (*df.shape, 1)) - np.arange(d))  # type: ignore
+    halves: Any = 0.5 * (np.reshape(TracedArray(df), (*df.shape, 1)) - np.arange(d))
     norm = add(
         multiply(df, 0.5 * d * math.log(2.0)),
         add(0.25 * d * (d - 1) * math.log(math.pi), np.sum(special.gammaln(halves), axis=-1).expression),

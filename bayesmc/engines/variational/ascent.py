@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -42,7 +43,7 @@ class Ascent:
 
     plan: Plan
     state: State
-    memory: list[object]
+    memory: list[dict[str, Any]]
     bounds: list[float] = field(default_factory=list)
     converged: bool = False
 
@@ -187,4 +188,4 @@ def _stored(plan: Plan, ascent: Ascent) -> Ascent:
 
 def _restored(plan: Plan, ascent: Ascent) -> None:
     for factor, known in zip(plan.factors, ascent.memory, strict=True):
-        factor.__dict__.update(known)  # type: ignore[arg-type]
+        factor.__dict__.update(known)

@@ -296,31 +296,35 @@ class ShareFactor(Factor):
 
 
 class TableFactor(Factor):
-    """Finite nodes that are independent, element by element: tables of probabilities, states first.
+    """A finite node, or several with the same plates: tables of probabilities of every element.
 
-    Tables, and the derivatives that they come from, are written over.
+    Joint states are the first axis, the last node changing fastest. Tables, and the derivatives that they come
+    from, are written over.
     """
 
     def __init__(
         self,
-        name: str,
-        size: int,
+        names: tuple[str, ...],
+        sizes: tuple[int, ...],
         shape: tuple[int, ...],
         seen: np.ndarray | None,
         one_by_one: bool = False,
     ) -> None:
-        self.names, self.seen, self.size = (name,), seen, size
+        self.names, self.seen, self.sizes = names, seen, sizes
+        self.size = size = math.prod(sizes)
         #: elements meet in a term, so that they are updated in turn
         self.one_by_one, self.elements = one_by_one, math.prod(shape)
-        self.table = moment(name, "table")
+        self.table = table_of(names)
         self.moments = (self.table,)
         self.shape = (size, *shape)
         self.shapes = {self.table: self.shape}
         self._entropy = 0.0
 
     def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
+        each = tuple(np.asarray(values[name]).astype(np.intp) for name in self.names)
+        joint = np.ravel_multi_index(each, self.sizes)
         states = np.arange(self.size).reshape((-1,) + (1,) * (len(self.shape) - 1))
-        state[self.table] = (np.asarray(values[self.names[0]]) == states).astype(float)
+        state[self.table] = (joint == states).astype(float)
 
     def update(self, state: State, slopes: Mapping[str, np.ndarray]) -> None:
         logs, old = slopes[self.table], state[self.table]
@@ -354,6 +358,11 @@ class TableFactor(Factor):
 
     def spreads(self, state: State) -> list[np.ndarray]:
         return [state[self.table].copy()]
+
+
+def table_of(names: tuple[str, ...]) -> str:
+    """The name of the leaf of a table's probabilities."""
+    return moment("\0".join(names), "table")
 
 
 def improper(name: str) -> UnsupportedError:

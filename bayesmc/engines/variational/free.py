@@ -77,7 +77,8 @@ class FreeFactor(Factor):
             total = add(total, volume)
         self.volume = total
         self.points, self.weights = rule(self.size, self.is_full)
-        self.mean, self.root = np.zeros(self.size), np.eye(self.size)
+        self.mean: np.ndarray = np.zeros(self.size)
+        self.root: np.ndarray = np.eye(self.size)
 
     def prepare(self, energy: Expression) -> None:
         """Make ready to climb, given the part of the energy that reads it."""
@@ -90,7 +91,7 @@ class FreeFactor(Factor):
         known = {**self.target.known, **values}
         parts = [node.freed(np.asarray(known[node.name], float), known) for node in self.nodes]
         self.mean = np.concatenate([p.reshape(-1) for p in parts])
-        scale = 0.1
+        scale = 0.1  # of a unit on the free line
         self.root = np.full(self.size, scale) if not self.is_full else scale * np.eye(self.size)
         state[FREE] = self.placed(self.points)
 

@@ -63,7 +63,7 @@ class MeanFieldApproximation:
 
     def probabilities(self, name: str) -> np.ndarray | None:
         part = self.part(name)
-        return np.moveaxis(part.table, 0, -1) if isinstance(part, TablePart) else None
+        return part.probabilities(name) if isinstance(part, TablePart) else None
 
     def covariance(self, *names: str) -> np.ndarray | None:
         parts = [self.part(name) for name in names]
@@ -147,7 +147,8 @@ class MeanField(Engine):
         in their standard deviations, log scales, probabilities) by more than ten times as much.
     blocks : sequence of tuples of str, optional
         Nodes that share one factor: ``[("mean", "cov")]`` for a normal mean and the gamma, inverse gamma,
-        Wishart or inverse Wishart node that scales it. Other blocks of numbers become jointly normal.
+        Wishart or inverse Wishart node that scales it. Other blocks of numbers become jointly normal;
+        finite nodes with the same plates have one table of joint states.
     sweeps : int
         At most, of one start.
     draws : int
@@ -296,8 +297,8 @@ class MeanField(Engine):
 
     def _plan(self, problem: Problem) -> Plan:
         """The plan of a problem, or the error that there is none, made once."""
-        key = ("mean field", tuple(map(tuple, self.blocks or ())))
-        kept = problem.cache
+        key = tuple(map(tuple, self.blocks or ()))
+        kept: dict[Any, Any] = problem.cache.setdefault("mean-field plans", {})
         if key not in kept:
             try:
                 kept[key] = plan_for(target_of(problem), self.blocks or ())

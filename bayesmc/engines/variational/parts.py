@@ -37,7 +37,8 @@ _LOG_2PI = math.log(2 * math.pi)
 class Part(Protocol):
     """One factor as a distribution."""
 
-    names: tuple[str, ...]
+    @property
+    def names(self) -> tuple[str, ...]: ...
 
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
         """Stored values of its nodes, and the log density of each draw."""
@@ -60,7 +61,7 @@ class Known:
 
     def put(self, drawn: np.ndarray, inner: int = 0) -> np.ndarray:
         """Values with what was seen in its place; ``inner`` axes are inside an element."""
-        if self.mask is None:
+        if self.mask is None or self.value is None:
             return drawn
         return np.where(self.mask.reshape(self.mask.shape + (1,) * inner), self.value, drawn)
 
@@ -217,11 +218,12 @@ class SharePart:
 
 @dataclass(frozen=True, eq=False)
 class TablePart:
-    """Tables of states, shape (states, *plates)."""
+    """Tables of joint states, shape (states, *plates)."""
 
     names: tuple[str, ...]
     table: np.ndarray
-    dtype: np.dtype
+    sizes: tuple[int, ...]
+    dtypes: tuple[np.dtype, ...]
 
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
         levels = np.cumsum(self.table, axis=0)
@@ -234,7 +236,18 @@ class TablePart:
         with np.errstate(divide="ignore"):
             logs = np.log(self.table)
         log = np.take_along_axis(logs[None], state[:, None], axis=1)[:, 0]
-        return {self.names[0]: state.astype(self.dtype)}, log.reshape(draws, -1).sum(axis=1)
+        each = np.unravel_index(state, self.sizes)
+        values = {
+            name: own.astype(dtype)
+            for name, own, dtype in zip(self.names, each, self.dtypes, strict=True)
+        }
+        return values, log.reshape(draws, -1).sum(axis=1)
+
+    def probabilities(self, name: str) -> np.ndarray:
+        """Of one node, shape (*plates, states)."""
+        whole = self.table.reshape(*self.sizes, *self.table.shape[1:])
+        others = tuple(k for k, n in enumerate(self.names) if n != name)
+        return np.moveaxis(whole.sum(axis=others), 0, -1)
 
     def marginal(self, name: str) -> Marginal | None:
         return None
@@ -320,15 +333,13 @@ def part_of(factor: Factor, state: State, target: Target) -> Part:
     if isinstance(factor, NormalFactor):
         return NormalPart(factor.names, state[factor.mean], state[factor.cov], factor.seen)
     if isinstance(factor, TableFactor):
-        domain = target.model[factor.names[0]].domain
-        assert domain is not None
-        return TablePart(factor.names, state[factor.table], domain.dtype)
-    seen = target.seen(factor.own.name)  # type: ignore[attr-defined]
-    known = (
-        Known()
-        if seen is None
-        else Known(np.broadcast_to(seen.mask, factor.seen.shape), seen.value)
-    )  # type: ignore
+        domains = [target.model[name].domain for name in factor.names]
+        dtypes = tuple(d.dtype for d in domains if d is not None)
+        return TablePart(factor.names, state[factor.table], factor.sizes, dtypes)
+    assert isinstance(factor, (ShareFactor, ScatterFactor))
+    seen, known = target.seen(factor.own.name), Known()
+    if seen is not None and factor.seen is not None:
+        known = Known(factor.seen, seen.value)
     if isinstance(factor, ShareFactor):
         return SharePart(factor.names, factor.concentration, factor.own.kind == "simplex", known)
     assert isinstance(factor, ScatterFactor)

@@ -24,6 +24,8 @@ from bayesmc.structure.target import Target
 
 #: elements of a plate that are made jointly normal where they meet
 _JOINT = 400
+#: joint states of a block of finite nodes
+_STATES = 1 << 12
 #: relative error that the energy of points may have
 _ROUNDING = 1e-8
 
@@ -60,6 +62,7 @@ class _Chooser:
         self.scales: dict[str, str] = {}
         self.kinds: dict[str, str] = {}
         self.tables: dict[str, int] = {}
+        self.groups: dict[str, tuple[str, ...]] = {}
         for name in target.chain:
             node = target.model[name]
             seen = target.seen(name)
@@ -84,10 +87,9 @@ class _Chooser:
                 raise UnsupportedError(
                     f"MeanField(blocks=): {name!r} is no hidden node that something observed depends on"
                 )
-            if name in self.tables:
-                raise UnsupportedError(
-                    f"MeanField(blocks=): node {name!r} is finite; finite nodes are factors of their own"
-                )
+        if any(name in self.tables for name in block):
+            self._group(block)
+            return
         scales = [n for n in block if self.kinds.get(n) in ("positive", "matrix")]
         means = [n for n in block if self.kinds.get(n) == "number"]
         if len(block) == 2 and len(scales) == len(means) == 1:
@@ -100,6 +102,30 @@ class _Chooser:
             self.free[name] = (
                 f"it is asked for jointly with {', '.join(n for n in block if n != name)}"
             )
+
+    def _group(self, block: tuple[str, ...]) -> None:
+        """One table for several finite nodes."""
+        target = self.target
+        for name in block:
+            if name not in self.tables:
+                raise UnsupportedError(
+                    f"MeanField(blocks=): {block} has finite nodes and node {name!r}, which has numbers"
+                )
+            if target.seen(name) is not None:
+                raise UnsupportedError(
+                    f"MeanField(blocks=): finite node {name!r} is observed in part, and can have no table "
+                    "with others"
+                )
+        if len({target.model[n].plates for n in block}) > 1:
+            raise UnsupportedError(
+                f"MeanField(blocks=): finite nodes {block} have different plates"
+            )
+        count = math.prod(self.tables[n] for n in block)
+        if count > _STATES:
+            raise UnsupportedError(
+                f"MeanField(blocks=): {block} have {count} joint states, more than {_STATES}"
+            )
+        self.groups |= dict.fromkeys(block, block)
 
     def join(self, name: str) -> None:
         """Make all elements of a node jointly normal."""
@@ -126,7 +152,7 @@ class _Chooser:
         free = FreeFactor(target, list(self.free)) if self.free else None
         above = {} if free is None else free.above
         hidden = {n: self._hidden(n) for n in self.kinds if n not in self.free}
-        reader = TermReader(target, hidden, self.tables, above)
+        reader = TermReader(target, hidden, self.tables, above, self.groups)
         sums = []
         for term in target.terms.values():
             try:
@@ -144,7 +170,8 @@ class _Chooser:
         factors = self._factors(hidden, leaves)
         if free is not None:
             factors.append(free)
-        factors += [self._table(n, n in reader.meeting) for n in self.tables]
+        groups = dict.fromkeys(self.groups.get(n, (n,)) for n in self.tables)
+        factors += [self._table(g, not reader.meeting.isdisjoint(g)) for g in groups]
         try:
             plan = Plan(target, tuple(factors), tuple(sums), free, self._why(factors))
             _ = plan.steps
@@ -165,7 +192,9 @@ class _Chooser:
         means = {scale: mean for mean, scale in self.scales.items()}
         for name, own in hidden.items():
             seen = self.target.seen(name)
-            mask = None if seen is None else np.broadcast_to(seen.mask, self._plates(name))  # type: ignore
+            mask = (
+                None if seen is None else np.broadcast_to(np.asarray(seen.mask), self._plates(name))
+            )
             uses = {f for f in ("x", "inv", "log", "log1m") if moment(name, f) in leaves}
             if own.kind == "number":
                 if own.scale is None:
@@ -182,11 +211,11 @@ class _Chooser:
                 found.append(ShareFactor(own, mask))
         return found
 
-    def _table(self, name: str, meeting: bool) -> TableFactor:
-        node, seen = self.target.model[name], self.target.seen(name)
-        mask = None if seen is None else np.broadcast_to(seen.mask, node.plate_shape)  # type: ignore
-        assert node.domain is not None
-        return TableFactor(name, node.domain.size, node.plate_shape, mask, meeting)
+    def _table(self, names: tuple[str, ...], meeting: bool) -> TableFactor:
+        node, seen = self.target.model[names[0]], self.target.seen(names[0])
+        mask = None if seen is None else np.broadcast_to(np.asarray(seen.mask), node.plate_shape)
+        sizes = tuple(self.tables[n] for n in names)
+        return TableFactor(names, sizes, node.plate_shape, mask, meeting)
 
     def _plates(self, name: str) -> tuple[int, ...]:
         return self.target.model[name].plate_shape
@@ -206,7 +235,8 @@ class _Chooser:
                 f"{len(factor.weights)} points): {self.free[name]}"
             )
         if isinstance(factor, TableFactor):
-            return f"closed form: a table of {factor.size} states for every element"
+            joint = "" if len(factor.names) == 1 else f", jointly ({', '.join(factor.names)})"
+            return f"closed form: a table of {factor.size} states for every element{joint}"
         if isinstance(factor, NormalFactor):
             joint = ", all elements jointly, since they meet" if name in self.joined else ""
             return f"closed form: normal{joint}"
@@ -238,9 +268,8 @@ def hold_at_points(plan: Plan) -> None:
             if seen is not None:
                 node = target.model[name]
                 inner = (1,) * len(node.event_shape)
-                mask = np.broadcast_to(seen.mask, node.plate_shape).reshape(
-                    node.plate_shape + inner
-                )  # type: ignore
+                mask = np.broadcast_to(np.asarray(seen.mask), node.plate_shape)
+                mask = mask.reshape(node.plate_shape + inner)
                 values[name] = np.where(mask, seen.value, values[name])
         target.refresh(values, target.chain)
         with np.errstate(all="ignore"):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import InverseWishart, LogNormal, MvNormal, Normal, Wishart
-from bayesmc.engines.variational.factors import IMPOSSIBLE
+from bayesmc.engines.variational.factors import IMPOSSIBLE, table_of
 from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import (
     Constant,
@@ -46,7 +46,7 @@ from bayesmc.passes.expected_density import (
     quadratic_moments,
 )
 from bayesmc.passes.log_density import family_of
-from bayesmc.passes.moments import Hidden, NoMoment, moment
+from bayesmc.passes.moments import Hidden, NoMoment
 from bayesmc.passes.reads import element_read
 from bayesmc.passes.widening import widened
 from bayesmc.structure.free_terms import elements, known_values
@@ -117,6 +117,8 @@ class TermReader:
         Finite node -> how many states it has.
     above : mapping
         Node -> its value, of those that are normal in unconstrained coordinates.
+    groups : mapping, optional
+        Finite node -> all nodes that it has one table with.
     """
 
     def __init__(
@@ -125,8 +127,10 @@ class TermReader:
         hidden: Mapping[str, Hidden],
         tables: Mapping[str, int],
         above: Mapping[str, Expression],
+        groups: Mapping[str, tuple[str, ...]] | None = None,
     ) -> None:
         self.target, self.hidden, self.tables, self.above = target, hidden, tables, above
+        self.groups = {} if groups is None else groups
         #: finite nodes several of whose elements meet in an entry
         self.meeting: set[str] = set()
 
@@ -158,7 +162,7 @@ class TermReader:
         family = read if isinstance(read, Family) else family_of(read)
         family = mapped(family, lambda e: substituted(e, given))
         value = self._value(term, given)
-        if len(finite) == 1:
+        if len(finite) == 1 and finite[0] not in self.groups:
             found = self._by_label(term, family, value, finite[0])
             if found is not None:
                 return Sum(term.name, None, found)
@@ -268,20 +272,49 @@ class TermReader:
         log = _possible(broadcast(log, shape))
         if term.mask is not None:
             log = tidy(np.where, np.broadcast_to(term.mask, term.shape), log, 0.0)
-        for name, own in zip(finite, states, strict=True):
-            log = multiply(log, self._weights(name, own, len(term.shape)))
+        of = dict(zip(finite, states, strict=True))
+        for group in dict.fromkeys(self.groups.get(n, (n,)) for n in finite):
+            inside = {n: of[n] for n in group if n in of}
+            weights = (
+                self._weights(*inside.popitem(), len(term.shape))
+                if len(group) == 1
+                else self._joint_weights(group, inside)
+            )
+            log = multiply(log, weights)
         return reduction(np.add, broadcast(log, shape), range(len(shape)))
 
     def _weights(self, name: str, states: np.ndarray, rank: int) -> Expression:
         """The probability of each joint state for each entry."""
         shape = self.target.model[name].value_shape
         size, at = math.prod(shape), self._at[name]
-        own = leaf(moment(name, "table"), (self.tables[name], *shape))
+        own = leaf(table_of((name,)), (self.tables[name], *shape))
         if at is not None:
             rows = states.reshape((-1,) + (1,) * at.ndim) * size
             return pick([own], rows + at)
         each = pick([own], states * size + np.arange(size))
         return reshape(reduction(np.multiply, each, (1,)), (len(states),) + (1,) * rank)
+
+    def _joint_weights(
+        self, group: tuple[str, ...], states: Mapping[str, np.ndarray]
+    ) -> Expression:
+        """The same of nodes that have one table: others are summed out of it."""
+        shape = self.target.model[group[0]].value_shape
+        places = [self._at[n] for n in states]
+        first = places[0]
+        if first is None or any(at is None or not np.array_equal(at, first) for at in places):
+            raise UnsupportedError(
+                f"MeanField(blocks=): a term reads different elements of {', '.join(map(repr, states))}, "
+                "which have one table for every element"
+            )
+        sizes = [self.tables[n] for n in group]
+        own = leaf(table_of(group), (math.prod(sizes), *shape))
+        every = np.stack(np.unravel_index(np.arange(math.prod(sizes)), sizes))
+        fits = np.ones((len(next(iter(states.values()))), every.shape[1]), bool)
+        for name, wanted in states.items():
+            fits &= every[group.index(name)] == wanted
+        rows = np.nonzero(fits)[1].reshape(len(fits), -1)
+        at = rows.reshape(rows.shape + (1,) * first.ndim) * math.prod(shape) + first
+        return reduction(np.add, pick([own], at), (1,))
 
     # ---- labels ------------------------------------------------------------------------------------
 
@@ -315,7 +348,7 @@ class TermReader:
         for i in range(d):
             parts.append(pick([b], np.arange(states) * d + i))
             rows.append(off[:, i])
-        for i, j in zip(*np.tril_indices(d), strict=True):
+        for i, j in np.transpose(np.tril_indices(d)).tolist():
             parts.append(
                 multiply(
                     -0.5 if i == j else -1.0,

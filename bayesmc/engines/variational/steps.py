@@ -8,14 +8,13 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesmc.engines.variational.factors import Factor, State, TableFactor
+from bayesmc.engines.variational.factors import Factor, State, TableFactor, table_of
 from bayesmc.engines.variational.free import FREE, FreeFactor
 from bayesmc.engines.variational.reading import LabelTerm, Sum
 from bayesmc.expression import Expression, Program
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.derivatives import gradient
-from bayesmc.passes.moments import moment
 from bayesmc.structure.target import Target
 
 
@@ -38,7 +37,7 @@ class ByLabel:
 
     def add_up(self, state: State) -> None:
         """Put the expected sums of statistics under a new table into the state."""
-        table = state[moment(self.terms[0].label, "table")]
+        table = state[table_of((self.terms[0].label,))]
         sums = table.reshape(len(table), -1) @ self._turned
         for term, part in zip(self.terms, self._parts, strict=True):
             state[term.sums.name] = sums[:, part]
