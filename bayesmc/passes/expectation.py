@@ -281,7 +281,7 @@ class Expectation:
                 else tidy(np.where, condition, self(first), second)
             )
         if self.names(condition):
-            raise self.refuse(node, "a branch on it has no expectation in closed form")
+            raise self.refuse(condition, "a branch on it has no expectation in closed form")
         return tidy(np.where, condition, self(first), self(second))
 
     # ---- products of powers ------------------------------------------------------------------------

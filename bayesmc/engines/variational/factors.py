@@ -298,8 +298,8 @@ class ShareFactor(Factor):
 class TableFactor(Factor):
     """A finite node, or several with the same plates: tables of probabilities of every element.
 
-    Joint states are the first axis, the last node changing fastest. Tables, and the derivatives that they come
-    from, are written over.
+    Joint states are the first axis, the last node changing fastest. Tables, and the derivatives that they
+    come from, are written over.
     """
 
     def __init__(
