@@ -12,6 +12,7 @@ from tests.mutants import (
     hamiltonian,
     slices,
     switching,
+    variational,
 )
 from tests.mutants.mutant import Mutant
 
@@ -21,6 +22,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *variational.MUTANTS,
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *slices.MUTANTS,
