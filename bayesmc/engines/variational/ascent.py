@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.engines.variational.factors import State, TableFactor
 from bayesmc.engines.variational.steps import Plan
@@ -103,7 +104,8 @@ def check_bound(before: float, now: float) -> None:
 
 def ascents(plan: Plan, restarts: int, rng: np.random.Generator) -> Iterator[Ascent]:
     """Starts far apart, one by one."""
-    values = start_states(plan.target, restarts, rng)
+    with marking_invalid(), np.errstate(all="ignore"):
+        values = start_states(plan.target, restarts, rng)
     for k in range(restarts):
         yield started(plan, values, k, rng)
 

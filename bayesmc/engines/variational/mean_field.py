@@ -14,12 +14,18 @@ from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.posterior import DRAWS, ApproximatePosterior
 from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
+from bayesmc.engines.variational.excluded import left_out
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
 from bayesmc.engines.variational.plan import plan_for
 from bayesmc.engines.variational.steps import Plan
 from bayesmc.engines.weighted.drawing import check_count
-from bayesmc.errors import ConvergenceWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import (
+    ConvergenceWarning,
+    ReducibleWarning,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless
 from bayesmc.progress import Progress
@@ -172,6 +178,8 @@ class MeanField(Engine):
     -----
     ConvergenceWarning
         The best start had not settled after all sweeps.
+    ReducibleWarning
+        Zero probabilities tie finite nodes, and states were left out that may be probable.
 
     References
     ----------
@@ -283,6 +291,15 @@ class MeanField(Engine):
             posterior.elbo, posterior.elbo_mcse = measured(plan, best, rng, constant)
         posterior.log_marginal_likelihood = posterior.elbo
         posterior.sweeps, posterior.converged = len(best.bounds), best.converged
+        tied = left_out(plan, best.state)
+        if tied:
+            warnings.warn(
+                f"MeanField: zero probabilities tie {', '.join(map(repr, tied[:6]))} to others, and "
+                "independent factors hold that in one of several ways: states that were left out may be "
+                "probable; use Exact() or Gibbs(), or give such nodes one table (blocks=)",
+                ReducibleWarning,
+                stacklevel=3,
+            )
         if not best.converged:
             gain = best.bounds[-1] - best.bounds[-2] if len(best.bounds) > 1 else np.inf
             warnings.warn(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.variational.factors import (
     Factor,
     NormalFactor,
@@ -271,8 +272,8 @@ def hold_at_points(plan: Plan) -> None:
                 mask = np.broadcast_to(np.asarray(seen.mask), node.plate_shape)
                 mask = mask.reshape(node.plate_shape + inner)
                 values[name] = np.where(mask, seen.value, values[name])
-        target.refresh(values, target.chain)
-        with np.errstate(all="ignore"):
+        with marking_invalid(), np.errstate(all="ignore"):
+            target.refresh(values, target.chain)
             want = float(np.ravel(target.log_density(values))[0])
             state: State = {}
             plan.start(state, {n: values[n][0] for n in target.chain})
