@@ -21,6 +21,8 @@ ROUNDING = 1e-9
 _FIRST, _KEPT = 60, 3
 #: gain of one sweep, of the bound's size, below which a start is taken to be near its end
 _NEAR = 1e-6
+#: how far a figure may be from its end, as the rate of its steps tells
+_AHEAD = 1e-3
 #: how much coarser than the bound's tolerance that of the figures is
 _FIGURES = 10.0
 
@@ -62,19 +64,22 @@ class Ascent:
 
     def climb(self, sweeps: int, tolerance: float, near: float = 0.0) -> None:
         """Sweep until it has settled, or the gain is below a share of the bound."""
-        before = None
+        before, last = None, np.inf
         for _ in range(sweeps):
             gain = self.sweep()
             size = 1.0 + abs(self.bounds[-1])
             if gain <= tolerance * size:  # only then is it worth to look how far figures move
                 with np.errstate(all="ignore"):
                     now = [f for factor in self.plan.factors for f in factor.spreads(self.state)]
-                if before is not None and _moved(before, now) <= _FIGURES * tolerance:
-                    self.converged = True
-                    return
+                if before is not None:
+                    moved = _moved(before, now)
+                    if moved <= _FIGURES * tolerance and _ahead(last, moved) <= _AHEAD:
+                        self.converged = True
+                        return
+                    last = moved
                 before = now
             else:
-                before = None
+                before, last = None, np.inf
             if near and gain < near * size:
                 return
 
@@ -180,6 +185,14 @@ def _moved(before: Sequence[np.ndarray], now: Sequence[np.ndarray]) -> float:
             ),
             default=0.0,
         )
+
+
+def _ahead(last: float, moved: float) -> float:
+    """How far there is to go if every step is the same share of the one before."""
+    if moved <= 0.0 or last == np.inf:
+        return 0.0 if moved <= 0.0 else np.inf
+    rate = moved / last if last > 0 else 1.0
+    return moved * rate / (1.0 - rate) if rate < 1.0 else np.inf
 
 
 def _stored(plan: Plan, ascent: Ascent) -> Ascent:

@@ -9,44 +9,40 @@ of closed forms become normal in unconstrained coordinates, and are values there
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import InverseWishart, LogNormal, MvNormal, Normal, Wishart
-from bayesmc.engines.variational.factors import IMPOSSIBLE, table_of
+from bayesmc.engines.variational.factors import table_of
+from bayesmc.engines.variational.labels import LabelTerm, by_label, possible
 from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import (
     Constant,
     Expression,
     Family,
-    Leaf,
-    as_expression,
     broadcast,
     constant,
     elementwise,
     expressions_of,
     leaf,
     mapped,
-    ordered,
     pick,
     reduction,
     reshape,
 )
 from bayesmc.expression.graph import cast, substituted
-from bayesmc.kernels.label_sums import label_sums
 from bayesmc.network.expressions import Opaque, stored_leaf
-from bayesmc.passes.arithmetic import add, multiply, subtract, tidied, tidy
+from bayesmc.passes.arithmetic import multiply, tidied, tidy
 from bayesmc.passes.expectation import Expectation
 from bayesmc.passes.expected_density import (
     expected_log_density,
     plain_density,
-    quadratic_moments,
 )
 from bayesmc.passes.log_density import family_of
-from bayesmc.passes.moments import Hidden, NoMoment
+from bayesmc.passes.moments import Hidden
 from bayesmc.passes.reads import element_read
 from bayesmc.passes.widening import widened
 from bayesmc.structure.free_terms import elements, known_values
@@ -64,30 +60,6 @@ _NDIM: dict[Any, Mapping[str, int]] = {
     Wishart: {"df": 0, "scale": 2},
     InverseWishart: {"df": 0, "scale": 2},
 }
-
-
-@dataclass(frozen=True, eq=False)
-class LabelTerm:
-    """What elements of a plate say by a label, ``sum_j statistics[j, n] * coefficients[label_n, j]``.
-
-    Attributes
-    ----------
-    label : str
-    statistics : ndarray, shape (rows, elements)
-    coefficients : Expression, shape (states, rows)
-        Of moments.
-    sums : Leaf, shape (states, rows)
-        Expected sums of the statistics by label.
-    """
-
-    label: str
-    statistics: np.ndarray
-    coefficients: Expression
-    sums: Leaf
-
-    @property
-    def total(self) -> Expression:
-        return reduction(np.add, multiply(self.sums, self.coefficients), (0, 1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +135,8 @@ class TermReader:
         family = mapped(family, lambda e: substituted(e, given))
         value = self._value(term, given)
         if len(finite) == 1 and finite[0] not in self.groups:
-            found = self._by_label(term, family, value, finite[0])
+            of = self._expectation(term)
+            found = by_label(self.target, of, term, family, value, finite[0], self.above)
             if found is not None:
                 return Sum(term.name, None, found)
         of = self._expectation(term)
@@ -269,7 +242,7 @@ class TermReader:
                 f"MeanField: term {term.name!r} has {math.prod(shape)} entries at all joint states of "
                 f"{', '.join(map(repr, finite))}; use Gibbs()"
             )
-        log = _possible(broadcast(log, shape))
+        log = possible(broadcast(log, shape))
         if term.mask is not None:
             log = tidy(np.where, np.broadcast_to(term.mask, term.shape), log, 0.0)
         of = dict(zip(finite, states, strict=True))
@@ -315,103 +288,6 @@ class TermReader:
         rows = np.nonzero(fits)[1].reshape(len(fits), -1)
         at = rows.reshape(rows.shape + (1,) * first.ndim) * math.prod(shape) + first
         return reduction(np.add, pick([own], at), (1,))
-
-    # ---- labels ------------------------------------------------------------------------------------
-
-    def _by_label(
-        self, term: Term, family: Family, value: Expression, label: str
-    ) -> LabelTerm | None:
-        node = self.target.model[label]
-        if term.shape != node.plate_shape or not node.plate_shape or term.mask is not None:
-            return None
-        of, states = self._expectation(term), self.tables[label]
-        if term.name == label:
-            return self._prior(of, term, family, states)
-        if family.make not in (Normal, LogNormal, MvNormal) or not isinstance(value, Constant):
-            return None
-        found = self._at_labels(term, label, states)
-        if found is None:
-            return None
-        y = np.log(value.value) if family.make is LogNormal else value.value
-        is_vector = family.make is MvNormal
-        y = y.reshape(-1, y.shape[-1] if is_vector else 1)
-        centre = y.mean(axis=0)
-        off = y - centre
-        d = off.shape[1]
-        loc = found.parameters["loc"]
-        loc = subtract(loc if is_vector else reshape(loc, (*loc.shape, 1)), centre)
-        precision, b, form, logs = quadratic_moments(of, loc, found.parameters, is_vector)
-        first = multiply(0.5, subtract(subtract(logs, form), d * math.log(2 * math.pi)))
-        parts = [broadcast(first, (states,))]
-        rows = [np.ones(len(off))]
-        b, precision = broadcast(b, (states, d)), broadcast(precision, (states, d, d))
-        for i in range(d):
-            parts.append(pick([b], np.arange(states) * d + i))
-            rows.append(off[:, i])
-        for i, j in np.transpose(np.tril_indices(d)).tolist():
-            parts.append(
-                multiply(
-                    -0.5 if i == j else -1.0,
-                    pick([precision], np.arange(states) * d * d + i * d + j),
-                )
-            )
-            rows.append(off[:, i] * off[:, j])
-        if family.make is LogNormal:
-            parts[0] = add(parts[0], -float(y.mean()))
-        at = np.arange(states * len(parts)).reshape(len(parts), states).T
-        return self._label_term(term, label, np.array(rows), pick(parts, at))
-
-    def _at_labels(self, term: Term, label: str, states: int) -> Family | None:
-        """A term's family at every label, parameters ``(states, *event)`` or one for all."""
-        found = label_sums(self.target, term, label)
-        if found is None or found.repeats > 1:
-            return None
-        family = found.family
-        parts = [*expressions_of(family)]
-        given = {**known_values(self.target, parts), **self.above}
-        family = mapped(family, lambda e: substituted(e, given))
-        made: dict[str, Any] = {}
-        for name, value in family.parameters.items():
-            made[name] = value
-            if value is not None:
-                inner = value.shape[len(value.shape) - _NDIM[family.make][name] :]
-                count = value.size // math.prod(inner)
-                if count not in (1, states):
-                    return None
-                made[name] = reshape(value, (count, *inner))
-        return Family(family.make, made)
-
-    def _prior(self, of: Expectation, term: Term, family: Family, states: int) -> LabelTerm | None:
-        """A label's own probabilities, where they are the same for all elements."""
-        node = self.target.model[term.name]
-        ndim = getattr(family.make, "parameter_ndim", None)
-        low = 0 if node.domain is None else node.domain.low
-        if ndim is None:
-            return None
-        made: dict[str, Any] = {}
-        for name, value in family.parameters.items():
-            if value is None:
-                made[name] = None
-                continue
-            if not isinstance(value, Expression) or name not in ndim:
-                return None
-            inner = value.shape[len(value.shape) - ndim[name] :]
-            if value.size != math.prod(inner):
-                return None
-            made[name] = reshape(value, (1, *inner))
-        value = as_expression(np.arange(states) + low)
-        log = broadcast(plain_density(Family(family.make, made), value), (states,))
-        found = _possible(of(tidied(log)))
-        rows = np.ones((1, math.prod(node.plate_shape)))
-        return self._label_term(
-            term, term.name, rows, reshape(broadcast(found, (states,)), (states, 1))
-        )
-
-    def _label_term(
-        self, term: Term, label: str, rows: np.ndarray, coefficients: Expression
-    ) -> LabelTerm:
-        sums = leaf(f"sums of \0{term.name}", coefficients.shape)
-        return LabelTerm(label, rows, coefficients, sums)
 
 
 def has_moments(target: Target, name: str) -> str | None:
@@ -465,20 +341,3 @@ def _wide(node: Expression, grid: Mapping[str, Expression], count: int) -> Expre
     if node.leaves & grid.keys():
         return widened(node, grid, count)
     return reshape(node, (1, *node.shape))
-
-
-def _possible(log: Expression) -> Expression:
-    """A log factor that is finite, so that products with a probability of 0 are 0."""
-    for node in _constants(log):
-        if (node.value == -np.inf).any():
-            return elementwise(np.maximum, log, IMPOSSIBLE)
-    return log
-
-
-def _constants(root: Expression) -> Iterator[Constant]:
-    for node in ordered(root):
-        if isinstance(node, Constant) and node.dtype.kind == "f":
-            yield node
-
-
-__all__ = ["LabelTerm", "NoMoment", "Sum", "TermReader", "has_moments"]

@@ -10,7 +10,8 @@ import numpy as np
 
 from bayesmc.engines.variational.factors import Factor, State, TableFactor, table_of
 from bayesmc.engines.variational.free import FREE, FreeFactor
-from bayesmc.engines.variational.reading import LabelTerm, Sum
+from bayesmc.engines.variational.labels import LabelTerm
+from bayesmc.engines.variational.reading import Sum
 from bayesmc.expression import Expression, Program
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.arrays import for_arrays
