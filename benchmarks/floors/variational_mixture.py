@@ -1,11 +1,12 @@
 """Variational Bayes of a Gaussian mixture by hand-written NumPy (Bishop 2006, sec. 10.2), one thread.
 
-A sweep updates weights, means with precisions, and responsibilities, and gives the evidence bound. Both start
-from the same responsibilities; the prior is Dirichlet(1), mean 0 with one observation's weight, Wishart(2, I).
+A sweep updates weights, means with precisions, and responsibilities, and gives the evidence bound. Both
+start from the same responsibilities; the prior is Dirichlet(1), mean 0 with the weight of one observation,
+Wishart(2, I).
 
 - :class:`Plain` is the textbook: a quadratic form for every point and component by ``einsum``.
-- :class:`Tuned` uses that a log density is linear in ``(1, x, y, x^2, xy, y^2)``: log densities are one matrix
-  product, sufficient statistics another; components first, so that reductions run along memory; in place.
+- :class:`Tuned` uses that a log density is linear in ``(1, x, y, x^2, xy, y^2)``: log densities are one
+  matrix product, sufficient statistics another; components first, so that sums run along memory; in place.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ def _expected(
     inverse: np.ndarray,
     scale: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Expected log weights and log determinants, and minus the divergence of the parameters from their prior."""
+    """Expected log weights and log determinants, and minus the divergence from the prior."""
     k, d = location.shape
     log_pi = special.digamma(alpha) - special.digamma(alpha.sum())
     halves = 0.5 * (df[:, None] - np.arange(d))
