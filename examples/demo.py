@@ -38,6 +38,7 @@ from examples import (
     switching_target,
     three_views,
     van_der_merwe,
+    variational_mixture,
     weight_collapse,
 )
 
@@ -47,7 +48,7 @@ FIGURES = (
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
     banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, coupled_chains, switching_target,
+    landmark_localization, range_only, coupled_chains, switching_target, variational_mixture,
 )  # fmt: skip
 
 

@@ -31,6 +31,7 @@ from examples import (
     picture,
     pushforward,
     rejection_and_importance,
+    variational_mixture,
 )
 
 EXAMPLES = (*demo.NETS, *demo.FIGURES)
@@ -480,3 +481,20 @@ def _mixture_by_hand(rng: np.random.Generator, joined: bool) -> dict[str, np.nda
         found.append(np.array(row)[:, np.argsort(mean[:, 1])])
     names = ("share", "mean wait", "sd of waits", "mean length", "correlation")
     return dict(zip(names, np.moveaxis(np.array(found[200:]), 1, 0), strict=True))
+
+
+# ---- components that die out --------------------------------------------------------------------------
+
+
+def test_variational_mixture_ends_with_two_components() -> None:
+    """Whatever the number to begin with, and from every start that is drawn; Bishop (2006), fig. 10.6."""
+    found = [variational_mixture.learnt(k, variational_mixture.SPARSE, restarts=3) for k in (2, 4)]
+    assert [variational_mixture.alive(p) for p in found] == [2, 2]
+    weights = np.sort(found[1].mean("weights"))[::-1]
+    np.testing.assert_allclose(weights[:2], [0.6429, 0.3571], atol=1e-4)
+    on_the_way = variational_mixture.learnt(
+        6, variational_mixture.SPARSE, 1, 25, variational_mixture.SEED
+    )
+    assert 2 < variational_mixture.alive(on_the_way) < 6
+    even = variational_mixture.learnt(3, variational_mixture.EVEN, restarts=3)
+    assert variational_mixture.alive(even) == 3 and even.elbo < -436.0
