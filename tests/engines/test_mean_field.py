@@ -17,7 +17,12 @@ from scipy import optimize, special
 
 import bayesmc as bmc
 from bayesmc.engines.variational.ascent import BoundError, check_bound
-from bayesmc.errors import ConvergenceWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import (
+    ConvergenceWarning,
+    ReducibleWarning,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.network import pose
 from bayesmc.testing import session
 
@@ -468,3 +473,36 @@ def test_plans_are_made_once() -> None:
     problem = pose(clutter(4), {"x": [0.1, 2.0, 2.2, -6.0]})
     engine = bmc.MeanField()
     assert engine._plan(problem) is engine._plan(problem)
+
+
+def test_edges_within_reach_and_angles_are_refused() -> None:
+    """A factor that is squeezed in front of an edge would look sure of itself."""
+    net = bmc.BayesNet(plates={"i": 5})
+    net.add("top", bmc.Gamma(2.0, 1.0))
+    net.add("y", lambda top: bmc.Uniform(0.0, top), plates="i")
+    with pytest.raises(UnsupportedError, match="'top' is zero within reach"):
+        bmc.infer(net, {"y": [0.1, 0.5, 1.0, 2.0, 1.5]}, engine=bmc.MeanField(restarts=1), rng=0)
+    net = bmc.BayesNet()
+    net.add("a", bmc.VonMises(0.0, 1.0))
+    net.add("y", lambda a: bmc.Normal(np.cos(a), 1.0))
+    with pytest.raises(UnsupportedError, match="'a' is an angle"):
+        bmc.infer(net, {"y": 1.0}, engine=bmc.MeanField())
+
+
+def test_zero_probabilities_that_tie_nodes_are_told() -> None:
+    """A copy: independent factors can say that both are 0 or that both are 1, and no more."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.5))
+    net.table("b", ["a"], [[1.0, 0.0], [0.0, 1.0]])
+    net.add("y", lambda a, b: bmc.Normal(a + 0.5 * b, 3.0))
+    with pytest.warns(ReducibleWarning, match="'a'"):
+        posterior = bmc.infer(net, {"y": 0.5}, engine=bmc.MeanField(), rng=0)
+    assert sorted(posterior.probabilities("a")) == [0.0, 1.0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        both = bmc.infer(net, {"y": 0.5}, engine=bmc.MeanField(blocks=[("a", "b")]), rng=0)
+        known = bmc.infer(net, {"y": 0.5, "a": 1}, engine=bmc.MeanField(), rng=0)  # no other way
+    np.testing.assert_allclose(
+        both.probabilities("a"), bmc.infer(net, {"y": 0.5}, engine=bmc.Exact()).probabilities("a")
+    )
+    assert known.probabilities("b")[1] == 1.0

@@ -35,6 +35,8 @@ FREE = "\0free numbers of the approximation"
 FULL = 40
 _HERMITE = {1: 40, 2: 24}
 _LOG_2PI = math.log(2 * math.pi)
+#: times that a factor is made ten times narrower where its bound is no number
+_SHRINKS = 10
 #: what stands for a bound that is no number
 _LOST = 1e200
 
@@ -101,6 +103,10 @@ class FreeFactor(Factor):
 
     def update(self, state: State, slopes: Mapping[str, np.ndarray]) -> None:
         """Some quasi-Newton steps, in units of what the factor is now; they are taken if the bound gains."""
+        for _ in range(_SHRINKS):  # where it overflows, nearer to its middle
+            if self._lost(self._origin(), state)[0] < _LOST:
+                break
+            self.root = 0.1 * self.root
         best = optimize.minimize(
             self._lost, self._origin(), args=(state,), jac=True, method="L-BFGS-B",
             options={"maxiter": self.steps, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-10},

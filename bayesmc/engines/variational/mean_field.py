@@ -35,6 +35,8 @@ from bayesmc.structure.target import Target, target_of
 
 #: bounds below this are of what is impossible
 NEVER = -1e250
+#: how much farther than the points of a rule it is looked for an edge, and how many draws look
+_REACH, _DRAWS = 1.6, 2048
 #: sets of fresh points that measure a bound
 _REPEATS = 16
 
@@ -338,12 +340,22 @@ def measured(
     free = plan.free
     entropy = sum(f.entropy(best.state) for f in plan.factors) + constant
 
-    def average(z: np.ndarray, weights: np.ndarray) -> float:
+    def values(z: np.ndarray) -> np.ndarray:
         u = free.placed(z)
         with np.errstate(all="ignore"):
             logs = plan.values({**best.state, FREE: u}) + free.log_volumes(u)
-        return float(weights @ np.broadcast_to(logs, weights.shape))
+        return np.broadcast_to(logs, len(z))
 
+    def average(z: np.ndarray, weights: np.ndarray) -> float:
+        return float(weights @ values(z))
+
+    reach = np.concatenate([_REACH * free.points, rng.standard_normal((_DRAWS, free.size))])
+    if (values(reach) == -np.inf).any():  # factors shrink until their points are inside
+        raise UnsupportedError(
+            f"MeanField: the density of {', '.join(map(repr, free.names[:4]))} is zero within reach of a "
+            "normal factor (bounds that depend on other nodes), which would be squeezed in between; use "
+            "Gibbs() or HamiltonianMonteCarlo()"
+        )
     finer = finer_rule(free.size)
     if finer is not None:
         found = average(*finer)

@@ -70,6 +70,15 @@ class _Chooser:
             if node.domain is not None:
                 self.tables[name] = node.domain.size
                 continue
+            if node.angles is not None:
+                raise UnsupportedError(
+                    f"MeanField: node {name!r} is an angle, and has no factor; use Gibbs() or "
+                    "HamiltonianMonteCarlo()"
+                )
+            if node.is_discrete:
+                raise UnsupportedError(
+                    f"MeanField: node {name!r} is discrete and has no finite set of states; use Gibbs()"
+                )
             kind = has_moments(target, name)
             if kind is None:
                 self.free[name] = "its support has no closed form"
@@ -158,8 +167,11 @@ class _Chooser:
         for term in target.terms.values():
             try:
                 sums.append(reader(term))
-            except (NoMoment, UnsupportedError):
+            except (Meeting, UnsupportedError):
                 raise
+            except NoMoment as error:
+                where = "potential" if term.is_potential else "density of"
+                raise NoMoment(f"in the {where} {term.name!r} {error}", error.names) from error
             except TraceError as error:
                 kind = "potential" if term.is_potential else "node"
                 raise UnsupportedError(f"MeanField: {kind} {term.name!r}: {error}") from error
@@ -232,7 +244,7 @@ class _Chooser:
         if isinstance(factor, FreeFactor):
             shape = "full" if factor.is_full else "diagonal"
             return (
-                f"normal in unconstrained coordinates ({shape} covariance of {factor.size} numbers, "
+                f"normal in unconstrained coordinates ({shape} covariance, {factor.size} in all, "
                 f"{len(factor.weights)} points): {self.free[name]}"
             )
         if isinstance(factor, TableFactor):
