@@ -9,6 +9,8 @@ from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions import Laplace
+from bayesmc.engines.approximate.laplace import LaplaceApproximation
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
@@ -179,6 +181,10 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
 
 
 def _checked(engine: Any) -> Any:
+    if (
+        isinstance(engine, Laplace) and engine.is_standard
+    ):  # the method has its name from the same man
+        return LaplaceApproximation()
     if isinstance(engine, type):
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"

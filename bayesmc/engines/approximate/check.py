@@ -16,22 +16,20 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from bayesmc.categorical import log_sum_exp
 from bayesmc.diagnostics import MAX_PARETO_K, pareto_k
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.approximate.approximation import Approximation
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.stored import as_stored, completed
 from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Problem
-from bayesmc.results import DrawsPosterior
+from bayesmc.results import DrawsPosterior, Posterior
 from bayesmc.structure.target import target_of
-
-if TYPE_CHECKING:
-    from bayesmc.engines.approximate.posterior import ApproximatePosterior
 
 #: draws of which a tail can be told at all
 _FEWEST = 25
@@ -69,15 +67,16 @@ class Check:
         Corrected answers: the draws with smoothed weights, and Monte Carlo errors that count these.
     log_marginal_likelihood, log_marginal_likelihood_mcse : float
         The corrected log evidence, and its error.
-    approximate : Posterior
-        The posterior that was checked.
+    approximate, approximation : Posterior, Approximation
+        What was checked.
     draws : int
     """
 
     k: float
     bound: float
     posterior: CheckedPosterior
-    approximate: Any = field(repr=False)
+    approximate: Posterior = field(repr=False)
+    approximation: Approximation = field(repr=False)
     draws: int
 
     @property
@@ -105,7 +104,7 @@ class Check:
         ess = self.posterior.weight_ess
         lines = [
             f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, "
-            f"weighed in the nodes' own coordinates (made in {self.approximate.approximation.coordinates})",
+            f"weighed in the nodes' own coordinates (made in {self.approximation.coordinates})",
             f"Pareto k {self.k:.2f} (bound {self.bound:.2f}), {ess:.0f} draws' worth: {verdict}",
         ]
         plain = self.approximate.log_marginal_likelihood
@@ -131,7 +130,7 @@ class Check:
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
                 continue
             # of what draws answer the same draws without weights: what moves is no chance
-            closed = self.approximate.approximation.marginal(name) is not None
+            closed = self.approximation.marginal(name) is not None
             before_weights = self.approximate if closed else self._unweighted
             plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
             before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
@@ -157,16 +156,18 @@ class Check:
         return lines
 
 
-def checked(posterior: ApproximatePosterior, draws: int, rng: np.random.Generator) -> Check:
+def checked(
+    posterior: Posterior, approximation: Approximation, draws: int, rng: np.random.Generator
+) -> Check:
     """See ``ApproximatePosterior.check``."""
     if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < _FEWEST:
         raise ValueError(
             f"check(draws={draws!r}): draws is a whole number, {_FEWEST} or more, such as 4000"
         )
     problem = posterior._live("check")
-    drawn = posterior.approximation.draw(rng, int(draws))
-    values = completed(problem, posterior.approximation.names, drawn, rng)
-    log_target = log_joint(problem, posterior.approximation.names, values, int(draws))
+    drawn = approximation.draw(rng, int(draws))
+    values = completed(problem, approximation.names, drawn, rng)
+    log_target = log_joint(problem, approximation.names, values, int(draws))
     with np.errstate(invalid="ignore"):
         raw = log_target - drawn.log_density
     raw = np.where(np.isnan(raw), -np.inf, raw)
@@ -190,7 +191,7 @@ def checked(posterior: ApproximatePosterior, draws: int, rng: np.random.Generato
     ess = found.weight_ess
     assert ess is not None
     found.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
-    result = Check(k, _bound(int(draws)), found, posterior, int(draws))
+    result = Check(k, _bound(int(draws)), found, posterior, approximation, int(draws))
     if not result.ok:
         warnings.warn(
             f"check: the weights of {draws} draws of {type(posterior.engine).__name__} have a heavy tail "

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import linalg, special
 
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.distributions.transforms import Bounded, Identity, SideBySide, Transform, Wrapped
+from bayesmc.distributions.transforms import Bounded, Identity, Transform, Wrapped
 from bayesmc.engines.approximate.approximation import Drawn, Marginal
 from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import Program
@@ -143,7 +143,7 @@ class FreeGaussian:
             values = self.density.constrain(u)
             log = log - self.density.log_volume(u)
         states, given = drawn_states(self.density, u, rng)
-        round_and_round = (np.abs(away) > np.pi) & self._angles
+        round_and_round = (np.abs(away) > np.pi) & self.density.angles
         log = np.where(round_and_round.any(axis=1), np.inf, log + given)
         return Drawn({**values, **states}, log)
 
@@ -171,20 +171,6 @@ class FreeGaussian:
         return np.sqrt(np.square(inverse).sum(axis=0))
 
     # ---- private -------------------------------------------------------------------------------
-
-    @cached_property
-    def _angles(self) -> np.ndarray:
-        assert self.density is not None
-        parts = []
-        for node in self.density.nodes:
-            count = int(np.prod(node.lead))
-            each = (
-                np.zeros(node.own_shape, bool)
-                if node.transform is None
-                else _is_angle(node.transform)
-            )
-            parts.append(np.broadcast_to(each.ravel(), (count, each.size)).ravel())
-        return np.concatenate(parts)
 
     @cached_property
     def _by_name(self) -> dict[str, FreeNode]:
@@ -323,13 +309,6 @@ class FreeGaussian:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _is_angle(transform: Transform) -> np.ndarray:
-    """Which of the free numbers of one element are angles."""
-    if isinstance(transform, SideBySide):
-        return np.concatenate([np.atleast_1d(_is_angle(part)).ravel() for part in transform.parts])
-    return np.full(transform.unconstrained_shape, isinstance(transform, Wrapped))
 
 
 def _places(node: FreeNode) -> np.ndarray:

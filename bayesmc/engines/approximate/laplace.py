@@ -52,7 +52,7 @@ class LaplaceApproximation(Engine):
     where data are many, and wrong where the posterior is skewed, heavy-tailed, curved or has several modes:
     hierarchies whose scale is poorly known, above all. ``posterior.check()`` tells.
 
-    ``bmc.Laplace()`` without ``loc`` and ``scale`` is this engine, with them the distribution.
+    ``engine=bmc.Laplace()`` asks for it, too: the standard distribution of that name cannot be an engine.
 
     Parameters
     ----------
