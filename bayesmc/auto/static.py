@@ -15,7 +15,6 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
-from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
@@ -116,7 +115,7 @@ def explained(
     if type(chosen).__name__ in refused:
         return Explanation(chosen, tuple(reasons), refused)
     nodes, table = chosen.describe(problem), tuple(chosen.table(problem))
-    effort = chosen.effort(problem) if isinstance(chosen, ChainEngine) else ""
+    effort = chosen.effort(problem)
     return Explanation(chosen, tuple(reasons), refused, nodes, table, effort)
 
 
