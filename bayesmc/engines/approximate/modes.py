@@ -28,8 +28,8 @@ _STILL, _ENOUGH = 1e-9, 1e-4
 #: how often a Newton step is cut, and the largest change of a free number by one
 _CUTS, _FARTHEST = 40, 20.0
 #: free numbers of bounded values beyond which there is no mode in sight, and from which on a climb that
-#: cannot go on was on its way there
-_ENDLESS, _FAR_OUT = 100.0, 30.0
+#: cannot go on was on its way there; and where one is stopped
+_ENDLESS, _FAR_OUT, _STOP = 100.0, 30.0, 120.0
 #: free numbers and slopes of values that go to the edge of their support, and what stands for the edge
 _OUT, _LEVEL, _EDGE = 10.0, 1e-3, 45.0
 #: standard deviations by which one mode is apart from another
@@ -158,6 +158,7 @@ def _climbed(
             start,
             jac=True,
             method="L-BFGS-B",
+            bounds=[(-reach, reach) for reach in np.where(_bounded(density), _STOP, np.inf)],
             options={
                 "maxiter": _FAR,
                 "maxfun": 3 * _FAR,
