@@ -48,7 +48,7 @@ def test_a_funnel_is_found_out() -> None:
         check = posterior.check(rng=SEED)
     assert check.k > 0.7
     assert not check.ok
-    assert "not to be trusted" in str(check)
+    assert "plain answers are not to be trusted" in str(check)
     assert check.posterior.mean("v") is not None  # they are there all the same
 
 

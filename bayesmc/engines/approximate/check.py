@@ -96,19 +96,20 @@ class Check:
         return self.posterior.log_marginal_likelihood_mcse
 
     def __str__(self) -> str:
-        verdict = (
-            "good: plain answers are near, corrected ones right within their errors"
-            if self.k < min(0.5, self.bound)
-            else "usable: take the corrected answers"
-            if self.ok
-            else "not to be trusted: ask HamiltonianMonteCarlo() or Gibbs()"
+        own, ess = self.posterior.k, self.posterior.weight_ess
+        plain_words = (
+            "near" if self.k < min(0.5, self.bound) else "off" if self.ok else "not to be trusted"
         )
-        ess = self.posterior.weight_ess
+        words = "right within their errors"
+        if not own < self.bound:
+            words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
+        elif not self.ok:
+            words += ", if nothing lies where no draw went"
         lines = [
-            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, "
-            f"weighed in the nodes' own coordinates (made in {self.approximation.coordinates})",
-            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): {verdict}",
-            f"corrected by draws whose k is {self.posterior.k:.2f}, worth {ess:.0f}",
+            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
+            f"own coordinates (made in {self.approximation.coordinates})",
+            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {plain_words}",
+            f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
         ]
         plain = self.approximate.log_marginal_likelihood
         if plain is not None:

@@ -148,9 +148,9 @@ class LaplaceApproximation(Engine):
     def effort(self, problem: Problem) -> str:
         size = self._density(problem).size
         return (
-            f"a Gaussian at the mode of {size} unconstrained numbers, evidence included: exact where nodes "
-            "are Normal and linear in one another, wrong where the posterior is skewed, heavy-tailed or has "
-            "several modes; posterior.check() tells how far"
+            f"on {size} unconstrained numbers: a Gaussian at their mode, for the evidence, too; exact where "
+            "nodes are Normal and linear in one another, wrong where the posterior is skewed, heavy-tailed or has "
+            "several modes (posterior.check() tells how far)"
         )
 
     def run(
