@@ -149,8 +149,8 @@ class LaplaceApproximation(Engine):
         size = self._density(problem).size
         return (
             f"on {size} unconstrained numbers: a Gaussian at their mode, for the evidence, too; exact where "
-            "nodes are Normal and linear in one another, wrong where the posterior is skewed, heavy-tailed or "
-            "has several modes (posterior.check() tells how far)"
+            "nodes are Normal and linear in one another, wrong where the posterior is skewed, heavy-tailed "
+            "or has several modes (posterior.check() tells how far)"
         )
 
     def run(
