@@ -48,6 +48,7 @@ from bayesmc.distributions import (
     WrappedNormal,
 )
 from bayesmc.engines.approximate.laplace import LaplaceApproximation
+from bayesmc.engines.approximate.posterior_mode import PosteriorMode, map
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
@@ -136,6 +137,7 @@ __all__ = [
     "PlateArray",
     "Poisson",
     "Posterior",
+    "PosteriorMode",
     "RandomWalk",
     "Recovery",
     "Rejection",
@@ -157,6 +159,7 @@ __all__ = [
     "infer",
     "io",
     "log_density",
+    "map",
     "markov",
     "montecarlo",
     "most_likely",

@@ -54,11 +54,6 @@ def _i1e_slope(x: Any, y: Any) -> Any:
     return special.i0e(x) - share - np.sign(x) * y
 
 
-def _never_moves(s: Any, a: Any, y: Any) -> Any:
-    """Of the order of a zeta function, which derivatives of the gamma function set: it is constant."""
-    return np.nan * s
-
-
 def _both(rule: Partial) -> tuple[Partial, Partial]:
     """Partial derivatives of a function of two arguments that may be exchanged."""
     return rule, lambda a, b, y: rule(b, a, y)
@@ -139,7 +134,6 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
     special.digamma: (lambda x, y: special.zeta(2.0, x),),
     special.i0e: (lambda x, y: special.i1e(x) - np.sign(x) * y,),
     special.i1e: (_i1e_slope,),
-    special.zeta: (_never_moves, lambda s, a, y: np.negative(s) * special.zeta(s + 1.0, a)),
     special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: np.true_divide(a, b)),
     special.xlog1py: (lambda a, b, y: np.log1p(b), lambda a, b, y: np.true_divide(a, 1.0 + b)),
 }

@@ -70,6 +70,11 @@ class UnconstrainedDensity:
         """A name for every free number: ``sd[2]``."""
         return [label for node in self.nodes for label in node.labels]
 
+    @cached_property
+    def angles(self) -> np.ndarray:
+        """Which free numbers are angles, shape (size,)."""
+        return np.concatenate([np.zeros(0, bool), *(node.angles for node in self.nodes)])
+
     def value(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None = None) -> np.ndarray:
         """The log density, shape the batch; minus infinity where it is zero or no number.
 

@@ -102,8 +102,7 @@ def unconstrained_density(
     kept = [e for e, t in zip(used, terms, strict=False) if t.name not in inside]
     kept += used[len(terms) :]
     root = _total([*sums_of(kept), *(table.total for table in tables)])
-    bounds = frozenset().union(*(b.leaves for node in nodes for b in node.bounds))
-    for name in sorted((root.leaves | bounds) & set(finite)):
+    for name in sorted(root.leaves & set(finite)):
         raise UnsupportedError(
             f"node {name!r} is to be summed out, and the bounds of a continuous node depend on it; use Gibbs"
         )

@@ -52,7 +52,7 @@ class LaplaceApproximation(Engine):
     where data are many, and wrong where the posterior is skewed, heavy-tailed, curved or has several modes:
     hierarchies whose scale is poorly known, above all. ``posterior.check()`` tells.
 
-    ``bmc.Laplace()`` without ``loc`` and ``scale`` is this engine, with them the distribution.
+    ``engine=bmc.Laplace()`` asks for it, too: the standard distribution of that name cannot be an engine.
 
     Parameters
     ----------
@@ -144,6 +144,14 @@ class LaplaceApproximation(Engine):
                     "nothing observed depends on it: drawn from the net, without approximation"
                 )
         return found
+
+    def effort(self, problem: Problem) -> str:
+        size = self._density(problem).size
+        return (
+            f"on {size} unconstrained numbers: a Gaussian at their mode, for the evidence, too; exact where "
+            "nodes are Normal and linear in one another, wrong where the posterior is skewed, heavy-tailed "
+            "or has several modes (posterior.check() tells how far)"
+        )
 
     def run(
         self,

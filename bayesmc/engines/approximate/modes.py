@@ -12,22 +12,26 @@ Nocedal and Wright (2006), Numerical Optimization, 2nd ed., sec. 3.4 (modified N
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
 
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.structure.curvature import Curvature, Curved
 from bayesmc.structure.free_density import UnconstrainedDensity
 
 #: iterations of the quasi-Newton method, and of Newton's
-_FAR, _NEAR = 2000, 200
+_FAR, _NEAR = 2000, 100
 #: standard deviations that a Newton step may still move the mode, where it is done, and where that is enough
 _STILL, _ENOUGH = 1e-9, 1e-4
 #: how often a Newton step is cut, and the largest change of a free number by one
 _CUTS, _FARTHEST = 40, 20.0
-#: free numbers beyond which there is no mode in sight
-_ENDLESS = 200.0
+#: free numbers of bounded values beyond which there is no mode in sight, and from which on a climb that
+#: cannot go on was on its way there; and where one is stopped
+_ENDLESS, _FAR_OUT, _STOP = 100.0, 30.0, 120.0
+#: free numbers and slopes of values that go to the edge of their support, and what stands for the edge
+_OUT, _LEVEL, _EDGE = 10.0, 1e-3, 45.0
 #: standard deviations by which one mode is apart from another
 _APART = 0.05
 
@@ -46,6 +50,8 @@ class Mode:
         Their lower Cholesky factor.
     step : float
         Standard deviations that a Newton step would still move it.
+    edge : ndarray of bool, shape (size,)
+        Free numbers that stand for values at the edge of their support, where they are left.
     starts : int
         How many starts ended there.
     """
@@ -55,6 +61,7 @@ class Mode:
     curved: Curved
     root: np.ndarray
     step: float
+    edge: np.ndarray
     starts: int = 1
 
     @property
@@ -75,35 +82,20 @@ class NoMode:
     reason: str
 
 
-def modes_of(density: UnconstrainedDensity, starts: np.ndarray) -> tuple[list[Mode], list[NoMode]]:
+def modes_of(
+    density: UnconstrainedDensity, starts: np.ndarray, edges: bool = False
+) -> tuple[list[Mode], list[NoMode]]:
     """The modes that starts lead to, the one with the highest density first, and climbs without one.
 
     Parameters
     ----------
     density : UnconstrainedDensity
     starts : ndarray, shape (starts, size)
+    edges : bool
+        Whether a mode may lie at the edge of a support, where the density has a limit.
     """
-    curvature = Curvature(density)
-    ends = sorted((_climbed(density, u) for u in starts), key=lambda end: -end[1])
-    found: list[Mode] = []
-    lost: list[NoMode] = []
-    for u, log in ends:
-        known = _known(found, u, log)
-        if known is None:
-            end = _polished(density, curvature, u)
-            if isinstance(end, NoMode):
-                lost.append(end)
-                continue
-            known = _known(found, end.u, end.log_density)
-            if known is None:
-                found.append(end)
-                continue
-        mode = found[known]
-        found[known] = Mode(
-            mode.u, mode.log_density, mode.curved, mode.root, mode.step, mode.starts + 1
-        )
-    found.sort(key=lambda mode: -mode.log_density)
-    return found, lost
+    with np.errstate(all="ignore"):
+        return _modes_of(density, starts, edges)
 
 
 def named(labels: Sequence[str], direction: np.ndarray, most: int = 6) -> str:
@@ -124,8 +116,34 @@ def named(labels: Sequence[str], direction: np.ndarray, most: int = 6) -> str:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _climbed(density: UnconstrainedDensity, start: np.ndarray) -> tuple[np.ndarray, float]:
-    """Where a quasi-Newton method leads."""
+def _modes_of(
+    density: UnconstrainedDensity, starts: np.ndarray, edges: bool
+) -> tuple[list[Mode], list[NoMode]]:
+    curvature = Curvature(density)
+    ends = sorted((_climbed(density, u, edges) for u in starts), key=lambda end: -end[1])
+    found: list[Mode] = []
+    lost: list[NoMode] = []
+    for u, log, edge in ends:
+        known = _known(density, found, u, log)
+        if known is None:
+            end = _polished(density, curvature, u, edge)
+            if isinstance(end, NoMode):
+                lost.append(end)
+                continue
+            known = _known(density, found, end.u, end.log_density)
+            if known is None:
+                found.append(end)
+                continue
+        mode = found[known]
+        found[known] = replace(mode, starts=mode.starts + 1)
+    found.sort(key=lambda mode: -mode.log_density)
+    return found, lost
+
+
+def _climbed(
+    density: UnconstrainedDensity, start: np.ndarray, edges: bool
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Where a quasi-Newton method leads, and which numbers it takes to the edge of their support."""
     from scipy.optimize import minimize
 
     def falling(u: np.ndarray) -> tuple[float, np.ndarray]:
@@ -140,6 +158,7 @@ def _climbed(density: UnconstrainedDensity, start: np.ndarray) -> tuple[np.ndarr
             start,
             jac=True,
             method="L-BFGS-B",
+            bounds=[(-reach, reach) for reach in np.where(_bounded(density), _STOP, np.inf)],
             options={
                 "maxiter": _FAR,
                 "maxfun": 3 * _FAR,
@@ -150,32 +169,51 @@ def _climbed(density: UnconstrainedDensity, start: np.ndarray) -> tuple[np.ndarr
         )
     u = np.asarray(found.x, dtype=float)
     log, before = float(density.value(u)), float(density.value(start))
-    return (u, log) if log >= before else (start, before)
+    if log < before:
+        u, log = start, before
+    edge = np.zeros(len(u), bool)
+    if edges:
+        _, slope = density.with_gradient(u)
+        out = _bounded(density) & (np.abs(u) > _OUT) & (np.abs(slope) < _LEVEL)
+        moved = np.where(out, np.sign(u) * _EDGE, u)
+        limit = float(density.value(moved))
+        if out.any() and limit >= log - 1e-3:
+            u, log, edge = moved, limit, out
+    return u, log, edge
 
 
-def _is_plain(node: object) -> bool:
-    transform = getattr(node, "transform", None)
-    return type(transform).__name__ in ("Identity", "Wrapped")
+def _bounded(density: UnconstrainedDensity) -> np.ndarray:
+    """Which free numbers stand for values with bounds."""
+    return np.repeat([n.is_bounded for n in density.nodes], [n.size for n in density.nodes])
 
 
-def _known(found: Sequence[Mode], u: np.ndarray, log: float) -> int | None:
+def _known(
+    density: UnconstrainedDensity, found: Sequence[Mode], u: np.ndarray, log: float
+) -> int | None:
     """Which mode a point is at, if any."""
     for k, mode in enumerate(found):
-        away = mode.root.T @ (u - mode.u)
+        away = u - mode.u
+        away = mode.root.T @ np.where(density.angles, wrap_angle(away), away)
         if np.linalg.norm(away) <= _APART and abs(log - mode.log_density) <= _APART:
             return k
     return None
 
 
-def _polished(density: UnconstrainedDensity, curvature: Curvature, u: np.ndarray) -> Mode | NoMode:
-    """Newton's method, from near a mode."""
+def _polished(
+    density: UnconstrainedDensity, curvature: Curvature, u: np.ndarray, edge: np.ndarray
+) -> Mode | NoMode:
+    """Newton's method, from near a mode; what is at an edge stays there."""
     value, slope = density.with_gradient(u)
     log = float(value)
     curved, root, length = None, None, np.inf
+    bounded = _bounded(density) & ~edge
+    slope = np.where(edge, 0.0, slope)
     for _ in range(_NEAR):
-        curved = curvature.at(u)
+        if (bounded & (np.abs(u) > _ENDLESS)).any():
+            return NoMode(u, log, _endless(density.labels, bounded, u, log))
+        curved = _without(curvature.at(u), edge)
         if not np.isfinite(curved.matrix).all():
-            return NoMode(u, log, "the log density has no second derivatives where a climb ended")
+            break
         scaled = _Scaled(curved)
         root = scaled.root
         direction = scaled.step(slope)
@@ -187,19 +225,15 @@ def _polished(density: UnconstrainedDensity, curvature: Curvature, u: np.ndarray
         ahead = _searched(density, u, log, slope, direction)
         if ahead is None:
             break
-        u, log, slope = ahead
+        u, log, slope = ahead[0], ahead[1], np.where(edge, 0.0, ahead[2])
     assert curved is not None
-    labels = density.labels
-    far = np.abs(u) > _ENDLESS
+    labels, out = density.labels, bounded & (np.abs(u) > _FAR_OUT)
+    settled = root is not None and length <= _ENOUGH
+    if not settled and (out & (slope * u > 0)).any():
+        return NoMode(u, log, _endless(labels, out, u, log))
+    if not np.isfinite(curved.matrix).all():
+        return NoMode(u, log, "the log density has no second derivatives where a climb ended")
     away = scaled.step(slope)
-    endless = far & _bounded(density)
-    if endless.any():
-        k = int(np.argmax(np.where(endless, np.abs(u), 0.0)))
-        return NoMode(
-            u, log,
-            f"the log density goes on rising as the free number of {labels[k]} runs off (it is {u[k]:.3g}, "
-            f"the log density {log:.6g}): there is no mode",
-        )  # fmt: skip
     if root is None:
         return NoMode(u, log, scaled.refused(labels))
     if not length <= _ENOUGH:
@@ -208,13 +242,23 @@ def _polished(density: UnconstrainedDensity, curvature: Curvature, u: np.ndarray
             f"a climb did not settle: another step would move {named(labels, away)} by {length:.2g} standard "
             "deviations",
         )  # fmt: skip
-    return Mode(u, log, curved, root, float(length))
+    return Mode(u, log, curved, root, float(length), edge)
 
 
-def _bounded(density: UnconstrainedDensity) -> np.ndarray:
-    """Which free numbers stand for bounded ones."""
-    parts = [np.full(node.size, not _is_plain(node)) for node in density.nodes]
-    return np.concatenate(parts) if parts else np.zeros(0, bool)
+def _without(curved: Curved, edge: np.ndarray) -> Curved:
+    """Curvatures of the numbers that are not at an edge; those that are have 1."""
+    if not edge.any():
+        return curved
+    apart = edge[:, None] | edge
+    return replace(curved, matrix=np.where(apart, np.diag(edge.astype(float)), curved.matrix))
+
+
+def _endless(labels: Sequence[str], out: np.ndarray, u: np.ndarray, log: float) -> str:
+    k = int(np.argmax(np.where(out, np.abs(u), 0.0)))
+    return (
+        f"there is no mode: the log density goes on rising as the free number of {labels[k]} runs off (it is "
+        f"{log:.6g} at {u[k]:.3g})"
+    )
 
 
 class _Scaled:

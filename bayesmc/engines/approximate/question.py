@@ -90,6 +90,11 @@ def _made(target: Target, who: str) -> UnconstrainedDensity:
     if not numbers:
         raise UnsupportedError(_nothing(target))
     density = unconstrained_density(target, None, [n for n in target.chain if n not in numbers])
+    bounds = frozenset().union(*(b.leaves for node in density.nodes for b in node.bounds))
+    for name in sorted(bounds & set(density.summed)):
+        raise UnsupportedError(
+            f"node {name!r} is to be summed out, and the bounds of a continuous node depend on it; use Gibbs"
+        )
     jumping = sorted(jumps(density))
     if jumping:
         raise UnsupportedError(

@@ -257,6 +257,15 @@ class MeanField(Engine):
                 found[name] = "drawn from the net given the others"
         return found
 
+    def effort(self, problem: Problem) -> str:
+        plan = self._plan(problem)
+        closed = sum("closed form" in why for why in plan.why.values())
+        return (
+            f"{len(plan.why)} nodes in {len(plan.factors)} factors, {closed} of them in closed form, from "
+            f"{self.restarts} starts; the log marginal likelihood is a lower bound, and variances are too small "
+            "where factors depend on each other (posterior.check() tells how far)"
+        )
+
     def run(
         self,
         problem: Problem,
