@@ -8,6 +8,7 @@ import json
 import math
 import pickle
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +95,7 @@ def test_faithful(reference_data: Path, kinds: int, alpha: float) -> None:
     file = json.loads((reference_data / "ep" / "vbgmm_faithful.json").read_text())
     want, points = file[f"a0={alpha},K={kinds}"], faithful(reference_data)
     net = mixture(len(points), kinds, alpha)
-    posterior = bmc.infer(net, {"x": points}, engine=BISHOP, rng=session.seed())
+    posterior = bmc.infer(net, {"x": points}, engine=replace(BISHOP, restarts=5), rng=1)
     assert posterior.converged and never_falls(posterior)
     assert abs(posterior.elbo - want["elbo"]) < 1e-3
     assert posterior.bounds[0] == posterior.elbo == posterior.bounds.max()
@@ -350,7 +351,7 @@ def test_closed_forms_beside_a_node_without() -> None:
     engine = bmc.MeanField(restarts=3)
     said = bmc.explain(net, {"y": y}, engine=engine).nodes
     assert said["mu"] == said["theta"] == "closed form: normal"
-    assert "unconstrained" in said["tau"] and "no expectation" in said["tau"]
+    assert "unconstrained" in said["tau"] and "in the density of 'tau'" in said["tau"]
     posterior = bmc.infer(net, {"y": y}, engine=engine, rng=0)
     assert posterior.converged and never_falls(posterior)
     # the fixed point of mu given the others: expected precisions of tau by its own draws

@@ -1,10 +1,8 @@
-"""Mean field on the random nets of the matrix of engines, with the bias that it is allowed.
+"""Mean field on the random nets of the matrix of engines: what holds in spite of its bias.
 
-Variances are too small and means may be off: what is held is that the bound is no more than the exact log
-evidence (within four errors of its integrals), that it never falls, that the corrected answers of ``check``
-are right where k is small (at the matrix's false-alarm rate, at fixed seeds), and that means of
-linear-Gaussian nets are exact where every factor has a closed form. Where zero probabilities tie nodes it
-must say so.
+Variances are too small and means may be off: by how much is held in ``test_approximations_agree``. Here: the
+bound is no more than the exact log evidence (within four errors of its integrals) and never falls, and means
+of linear-Gaussian nets are exact where every factor has a closed form.
 """
 
 from __future__ import annotations
@@ -16,13 +14,12 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import ConvergenceWarning, LowEssWarning, ReducibleWarning, UnsupportedError
+from bayesmc.errors import ConvergenceWarning, ReducibleWarning, UnsupportedError
 from bayesmc.network import pose
-from bayesmc.testing import compare, session
-from bayesmc.testing.verdict import NothingToCompare
-from tests.matrix import ALPHA, SHIFT, exact, problem
+from bayesmc.testing import session
+from tests.matrix import SHIFT, exact, problem
 
-NETS = range(SHIFT, SHIFT + session.scaled(12, 10))
+NETS = range(SHIFT, SHIFT + session.scaled(6, 20))
 #: least share of the nets of each kind that it must answer, settled
 LEAST = {"discrete": 0.6, "plates": 0.6, "hybrid": 0.6, "hybrid plates": 0.6, "gaussian": 0.6}
 
@@ -52,22 +49,15 @@ def wrong(kind: str, seed: int) -> str | None:
         return f"{kind} {seed}: the bound is above the log evidence by {above:.3g}"
     if (np.diff(posterior.elbos) < -1e-9).any():
         return f"{kind} {seed}: the bound fell"
-    closed = all("closed" in w for w in posterior.engine._plan(posterior.problem).why.values())
+    closed = all(
+        w.startswith("closed") for w in posterior.engine._plan(posterior.problem).why.values()
+    )
     if kind == "gaussian" and closed and is_linear(net, evidence):
         for name in posterior.approximation.names:
             off = np.abs(posterior.mean(name) - right.mean(name)) / posterior.std(name).max()
             if off.max() > 1e-4:
                 return f"{kind} {seed}: the mean of {name} is off by {off.max():.2g} sd"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LowEssWarning)
-        check = posterior.check(4000, rng=seed)
-    if not check.k < 0.5:  # further out errors are right only on the whole
-        return ""
-    try:
-        match = compare(check.posterior, right, ALPHA)
-    except NothingToCompare:
-        return ""
-    return "\n".join([f"{kind} {seed}:", *map(str, match.rejected)]) if match.rejected else ""
+    return ""
 
 
 def is_linear(net: bmc.BayesNet, evidence: dict[str, Any]) -> bool:
@@ -78,11 +68,8 @@ def is_linear(net: bmc.BayesNet, evidence: dict[str, Any]) -> bool:
 
 
 @pytest.mark.parametrize("kind", LEAST)
-def test_bound_and_corrected_answers(kind: str) -> None:
+def test_bound_and_means(kind: str) -> None:
     found = [wrong(kind, seed) for seed in NETS]
     faults = [f for f in found if f]
-    if SHIFT == 1 or session.seed() == 0:
-        assert not faults, "\n".join(faults)
-    else:  # at fresh seeds one chance rejection of comparisons is no fault
-        assert len(faults) <= 1, "\n".join(faults)
+    assert not faults, "\n".join(faults)
     assert sum(f is not None for f in found) >= LEAST[kind] * len(found)

@@ -259,11 +259,11 @@ class MeanField(Engine):
 
     def effort(self, problem: Problem) -> str:
         plan = self._plan(problem)
-        closed = sum("closed form" in why for why in plan.why.values())
+        closed = sum(why.startswith("closed form") for why in plan.why.values())
         return (
             f"{len(plan.why)} nodes in {len(plan.factors)} factors, {closed} of them in closed form, from "
-            f"{self.restarts} starts; the log marginal likelihood is a lower bound, and variances are too small "
-            "where factors depend on each other (posterior.check() tells how far)"
+            f"{self.restarts} starts; the log marginal likelihood is a lower bound, and variances are too "
+            "small where factors depend on each other (posterior.check() tells how far)"
         )
 
     def run(

@@ -167,11 +167,13 @@ class _Chooser:
         for term in target.terms.values():
             try:
                 sums.append(reader(term))
-            except (Meeting, UnsupportedError):
+            except Meeting:
                 raise
             except NoMoment as error:
                 where = "potential" if term.is_potential else "density of"
                 raise NoMoment(f"in the {where} {term.name!r} {error}", error.names) from error
+            except UnsupportedError:
+                raise
             except TraceError as error:
                 kind = "potential" if term.is_potential else "node"
                 raise UnsupportedError(f"MeanField: {kind} {term.name!r}: {error}") from error
