@@ -186,7 +186,7 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
         {"discrete": 0, "plates": 0, "hybrid": 0.2, "hybrid plates": 0.1, "gaussian": 0.4},
     ),
     "MeanField, corrected": (
-        by_check(bmc.MeanField(restarts=4), 4000),
+        by_check(bmc.MeanField(restarts=2), 4000),
         {"discrete": 0.2, "plates": 0.2, "hybrid": 0.2, "hybrid plates": 0.2, "gaussian": 0.2},
     ),
     "no engine named": (by(None), dict.fromkeys(KINDS, 0.9)),

@@ -55,7 +55,7 @@ APPROXIMATIONS: dict[str, tuple[Any, Allowed]] = {
         Allowed(0.6, 0.3, 1.0, 0.5, {"hybrid": 0.2, "hybrid plates": 0.05, "gaussian": 0.4}),
     ),
     "MeanField": (
-        bmc.MeanField(restarts=4),
+        bmc.MeanField(restarts=2),
         # of finite nodes all draws may weigh the same, and what is rare has not been drawn
         Allowed(0.5, 0.5, 1.0, 1.0, dict.fromkeys(KINDS, 0.2), 1e-2),
     ),

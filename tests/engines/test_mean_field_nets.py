@@ -29,7 +29,7 @@ def answered(net: bmc.BayesNet, evidence: dict[str, Any], seed: int) -> Any:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            posterior = bmc.infer(net, evidence, engine=bmc.MeanField(restarts=4), rng=seed)
+            posterior = bmc.infer(net, evidence, engine=bmc.MeanField(restarts=3), rng=seed)
         except UnsupportedError:
             return None
     kinds = [w.category for w in caught]

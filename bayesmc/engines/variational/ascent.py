@@ -21,8 +21,8 @@ ROUNDING = 1e-9
 _FIRST, _KEPT = 60, 3
 #: gain of one sweep, of the bound's size, below which a start is taken to be near its end
 _NEAR = 1e-6
-#: how far a figure may be from its end, as the rate of its steps tells
-_AHEAD = 1e-3
+#: how far a figure may be from its end, as the rate of its steps tells; steps that may be rounding
+_AHEAD, _STILL = 1e-3, 1e-10
 #: how much coarser than the bound's tolerance that of the figures is
 _FIGURES = 10.0
 
@@ -189,8 +189,10 @@ def _moved(before: Sequence[np.ndarray], now: Sequence[np.ndarray]) -> float:
 
 def _ahead(last: float, moved: float) -> float:
     """How far there is to go if every step is the same share of the one before."""
-    if moved <= 0.0 or last == np.inf:
-        return 0.0 if moved <= 0.0 else np.inf
+    if moved <= _STILL:
+        return 0.0
+    if last == np.inf:
+        return np.inf
     rate = moved / last if last > 0 else 1.0
     return moved * rate / (1.0 - rate) if rate < 1.0 else np.inf
 
