@@ -38,7 +38,6 @@ from bayesmc.expression import (
     Pick,
     TracedArray,
     broadcast,
-    call,
     constant,
     elementwise,
     pick,
@@ -229,7 +228,7 @@ class _Factors:
             own = of.hidden[name].moment("x" if p > 0 else "inv")
             matrix = substituted(base, {name: own})
         else:
-            matrix = base if p > 0 else call(np.linalg.inv, [base])
+            matrix = base if p > 0 else _inverse(base)
         if is_all(self.coefficient, 1.0):
             return matrix
         number = of.power(self.coefficient, exponent)
@@ -242,7 +241,7 @@ class _Factors:
             own = of.hidden[name].moment("log")
             found = pick([own], self.groups(of))
         else:
-            root: Any = TracedArray(call(np.linalg.cholesky, [base]))
+            root: Any = np.linalg.cholesky(TracedArray(base))
             logs: Any = np.log(np.linalg.diagonal(root))
             found = (2.0 * np.sum(logs, axis=-1)).expression if base.leaves else _log_det(base)
         found = multiply(self.power, found)
@@ -254,6 +253,13 @@ class _Factors:
         """Which matrix of its leaf each entry is."""
         d = self.base.shape[-1]
         return _numbers(of, self.base, d * d)[..., 0, 0]
+
+
+def _inverse(matrix: Expression) -> Expression:
+    if isinstance(matrix, Constant):
+        return constant(np.linalg.inv(matrix.value))
+    found: Any = np.linalg.inv(TracedArray(matrix))
+    return found.expression
 
 
 def _log_det(matrix: Expression) -> Expression:

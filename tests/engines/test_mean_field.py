@@ -17,9 +17,12 @@ import pytest
 from scipy import optimize, special
 
 import bayesmc as bmc
+from bayesmc.engines.approximate.check import log_joint
+from bayesmc.engines.approximate.stored import completed
 from bayesmc.engines.variational.ascent import BoundError, check_bound
 from bayesmc.errors import (
     ConvergenceWarning,
+    LowEssWarning,
     ReducibleWarning,
     UnsupportedError,
     ZeroProbabilityError,
@@ -507,3 +510,97 @@ def test_zero_probabilities_that_tie_nodes_are_told() -> None:
         both.probabilities("a"), bmc.infer(net, {"y": 0.5}, engine=bmc.Exact()).probabilities("a")
     )
     assert known.probabilities("b")[1] == 1.0
+
+
+# ---- ways in which labels and blocks come --------------------------------------------------------------
+
+
+def labelled(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Some labels are known, some points missing."""
+    net = bmc.BayesNet(plates={"k": 2, "n": 40})
+    net.add("w", bmc.Dirichlet(np.ones(2)))
+    net.add("m", bmc.Normal(0.0, 5.0), plates="k")
+    net.add("p", bmc.Gamma(1.0, 1.0), plates="k")
+    net.add("z", lambda w: bmc.Categorical(w), plates="n")
+    net.add("x", lambda z, m, p: bmc.LogNormal(m[z], p[z] ** -0.5), plates="n")
+    z = np.repeat([0, 1], 20)
+    x = np.exp(rng.normal(4.0 * z - 2.0, 1.0))
+    known, missing = np.arange(40) % 7 == 0, np.arange(40) % 5 == 0
+    return net, {"x": np.where(missing, np.nan, x), "z": np.where(known, z, np.nan)}
+
+
+def free_scales(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """A mixture whose scales have no closed form."""
+    net = bmc.BayesNet(plates={"k": 2, "n": 30})
+    net.add("s", bmc.HalfNormal(2.0), plates="k")
+    net.add("m", bmc.Normal(0.0, 5.0), plates="k")
+    net.add("z", bmc.Categorical([0.4, 0.6]), plates="n")
+    net.add("x", lambda z, m, s: bmc.Normal(m[z], s[z]), plates="n")
+    return net, {"x": rng.normal(np.repeat([-3.0, 3.0], 15), 1.0)}
+
+
+def two_plates(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Labels in two plates, with weights of their rows; vectors with known spreads."""
+    net = bmc.BayesNet(plates={"a": 4, "b": 7, "k": 2})
+    net.add("w", bmc.Dirichlet(np.ones(2)), plates="a")
+    net.add("m", bmc.MvNormal(np.zeros(2), 9.0 * np.eye(2)), plates="k")
+    net.add("z", lambda w: bmc.Categorical(w), plates=("a", "b"))
+    net.add(
+        "x", lambda z, m: bmc.MvNormal(m[z], scale_diag=np.array([1.0, 0.5])), plates=("a", "b")
+    )
+    return net, {"x": rng.normal(size=(4, 7, 2)) + 3.0 * rng.integers(0, 2, (4, 7, 1))}
+
+
+def factorial(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Two labels that add up."""
+    net = bmc.BayesNet(plates={"n": 30})
+    net.add("a", bmc.Normal(0.0, 5.0))
+    net.add("b", bmc.Normal(0.0, 5.0))
+    net.add("u", bmc.Bernoulli(0.5), plates="n")
+    net.add("v", bmc.Bernoulli(0.3), plates="n")
+    net.add("x", lambda a, b, u, v: bmc.Normal(a * u + b * v, 1.0), plates="n")
+    return net, {"x": rng.normal(3.0 * (rng.random(30) < 0.5) - 4.0 * (rng.random(30) < 0.3), 1.0)}
+
+
+def matrices(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """A Wishart precision whose scale is hidden, too."""
+    net = bmc.BayesNet(plates={"n": 20})
+    net.add("s", bmc.Wishart(5.0, np.eye(2)))
+    net.add("p", lambda s: bmc.Wishart(6.0, s / 4.0))
+    net.add("x", lambda p: bmc.MvNormal(np.zeros(2), np.linalg.inv(p)), plates="n")
+    return net, {"x": rng.normal(size=(20, 2))}
+
+
+@pytest.mark.parametrize(
+    ("make", "blocks"),
+    [
+        (labelled, None), (free_scales, None), (two_plates, None), (factorial, None),
+        (factorial, [("u", "v")]), (matrices, None),
+    ],
+)  # fmt: skip
+def test_the_bound_is_below_what_weighted_draws_say(make: Any, blocks: Any) -> None:
+    """By the model's own functions: what was read, entropies and densities of draws must all be right."""
+    net, seen = make(np.random.default_rng(4))
+    posterior = bmc.infer(net, seen, engine=bmc.MeanField(restarts=3, blocks=blocks), rng=0)
+    assert posterior.converged and never_falls(posterior)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LowEssWarning)
+        check = posterior.check(4000, rng=0)
+    gap = check.log_marginal_likelihood - posterior.elbo
+    error = 4 * np.hypot(check.log_marginal_likelihood_mcse, posterior.elbo_mcse)
+    assert -error < gap < 1.0 + error
+    # the mean of the log weights of draws is the bound itself
+    raw = log_weights(posterior, 4000)
+    assert (
+        abs(raw.mean() - posterior.elbo)
+        < 5 * raw.std() / math.sqrt(len(raw)) + 4 * posterior.elbo_mcse
+    )
+
+
+def log_weights(posterior: Any, draws: int) -> np.ndarray:
+    """Log density of the model less that of the approximation, of its own draws."""
+    rng = np.random.default_rng(1)
+    drawn = posterior.approximation.draw(rng, draws)
+    values = completed(posterior.problem, posterior.approximation.names, drawn, rng)
+    log = log_joint(posterior.problem, posterior.approximation.names, values, draws)
+    return log - drawn.log_density
