@@ -95,7 +95,9 @@ class MeanFieldPosterior(ApproximatePosterior):
     Attributes
     ----------
     elbo : float
-        The evidence lower bound that it ended with; ``log_marginal_likelihood`` is the same number.
+        The evidence lower bound that it ended with; ``log_marginal_likelihood`` is the same number. Where
+        nodes have no closed form it is measured by other points than it was climbed with, and so may differ
+        from the last of ``elbos``.
     elbo_mcse : float
         The error of its integrals: 0 where all factors have closed forms, else a standard error.
     elbos : ndarray
