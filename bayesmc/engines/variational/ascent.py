@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
-from bayesmc.engines.variational.factors import State, TableFactor
+from bayesmc.engines.variational.factors import ScatterFactor, ShareFactor, State, TableFactor
 from bayesmc.engines.variational.steps import Plan
 from bayesmc.errors import BayesmcError
 from bayesmc.structure.target import Values
@@ -23,6 +23,8 @@ _FIRST, _KEPT = 60, 3
 _NEAR = 1e-6
 #: how far a figure may be from its end, as the rate of its steps tells; steps that may be rounding
 _AHEAD, _STILL = 1e-3, 1e-10
+#: the smallest of positive numbers to begin with
+_LEAST = 1e-200
 #: how much coarser than the bound's tolerance that of the figures is
 _FIGURES = 10.0
 
@@ -150,6 +152,10 @@ def started(plan: Plan, values: Values, k: int, rng: np.random.Generator) -> Asc
     state: State = {}
     target = plan.target
     own = {n: v if target.is_known(n) else v[k] for n, v in values.items()}
+    for factor in plan.factors:  # draws of vague priors may have underflowed
+        if isinstance(factor, (ScatterFactor, ShareFactor)) and factor.own.kind != "matrix":
+            name = factor.own.name
+            own[name] = np.clip(own[name], _LEAST, 1.0 / _LEAST)
     plan.start(state, own)
     for step in plan.steps:
         factor = step.factor

@@ -23,8 +23,6 @@ from bayesmc.passes.moments import Hidden, moment
 
 State = dict[str, np.ndarray]
 _LOG_2PI = math.log(2 * math.pi)
-#: numbers that are small enough to begin with
-_LEAST = 1e-200
 #: log weights below this are taken for impossible
 IMPOSSIBLE = -1e300
 
@@ -180,8 +178,6 @@ class ScatterFactor(Factor):
     def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
         x = np.array(values[self.own.name], dtype=float)
         matrix = self.own.kind == "matrix"
-        if not matrix:  # a draw of a vague prior may have underflowed
-            x = np.clip(x, _LEAST, 1.0 / _LEAST)
         if self.is_inverse:
             state[self.precision] = np.linalg.inv(x) if matrix else 1.0 / x
         else:
@@ -272,7 +268,7 @@ class ShareFactor(Factor):
         with np.errstate(divide="ignore"):
             found = [np.log(x), np.log1p(-x)]
         for name, value in zip(self.moments, found, strict=False):
-            state[name] = np.maximum(value, math.log(_LEAST))
+            state[name] = np.maximum(value, IMPOSSIBLE)
 
     def update(self, state: State, slopes: Mapping[str, np.ndarray]) -> None:
         parts = [1.0 + slopes[name] for name in self.moments]
