@@ -59,9 +59,9 @@ def test_a_logistic_regression_is_fine() -> None:
     posterior = bmc.infer(net, evidence, engine=LAPLACE)
     check = posterior.check(rng=SEED)
     assert check.ok
-    assert check.k < 0.5
+    assert check.k < 0.6
     away = abs(check.posterior.mean("b") - posterior.mean("b")) / posterior.std("b")
-    assert away.max() < 0.15
+    assert away.max() < 0.25
     told = str(check)
     assert "Pareto k" in told
     assert "b[0]" in told
@@ -220,7 +220,7 @@ def test_impossible_draws_keep_weight_zero_and_equal_ones_have_no_tail() -> None
 
 # ---- models that others chose -------------------------------------------------------------------------
 
-#: model of BUGS or posteriordb -> whether a Gaussian at the mode is good enough to be corrected, where that is clear
+#: model of BUGS or posteriordb -> whether a Gaussian at the mode can be corrected, where that is clear
 PUBLISHED = {
     "beetles test1": True,
     "stacks": None,  # near the bound: by chance
