@@ -59,8 +59,9 @@ class Check:
     Attributes
     ----------
     k : float
-        Shape of the tail of the weights p/q: below 0.5 good, above ``bound`` not to be trusted. Minus
-        infinity where all weights are equal: the approximation is exact.
+        Shape of the tail of the weights p/q, or of those of draws with heavier tails (whichever is larger):
+        below 0.5 good, above ``bound`` not to be trusted. Minus infinity where all weights are equal: the
+        approximation is exact.
     bound : float
         The largest k at which as many draws can be trusted, 0.7 of some 2,200 draws or more.
     ok : bool
@@ -172,7 +173,10 @@ def checked(
     spread, found = getattr(approximation, "spread", None), own
     if spread is not None and own.k > -np.inf:
         found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
-    result = Check(own.k, _bound(int(draws)), found, posterior, approximation, int(draws))
+    k = max(
+        own.k, found.k
+    )  # mass that the approximation's own draws never meet shows in wider ones
+    result = Check(k, _bound(int(draws)), found, posterior, approximation, int(draws))
     if not result.ok:
         warnings.warn(_doubt(result), LowEssWarning, stacklevel=3)
     return result
