@@ -26,7 +26,9 @@ def log_constants(target: Target) -> float:
     >>> round(log_constants(target_of(pose(net, {"coin": 1, "count": 3}))), 4)  # log 0.25
     -1.3863
     """
-    return float(sum(np.sum(np.broadcast_to(t.log(target.known), t.shape)) for t in _left(target)))
+    with np.errstate(all="ignore"):  # of states that are impossible
+        logs = (np.sum(np.broadcast_to(t.log(target.known), t.shape)) for t in _left(target))
+        return float(sum(logs))
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -383,8 +383,7 @@ def known_factors(target: Target) -> float:
     ZeroProbabilityError
         One of them is zero.
     """
-    with np.errstate(all="ignore"):
-        found = log_constants(target)
+    found = log_constants(target)
     if found == -np.inf:
         raise ZeroProbabilityError("MeanField: the evidence has probability zero")
     return found
