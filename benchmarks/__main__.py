@@ -9,6 +9,7 @@ from benchmarks import (
     bench_gaussian,
     bench_gibbs,
     bench_marginal,
+    bench_mean_field,
     bench_robot_logs,
     bench_robots,
     bench_scale,
@@ -40,6 +41,8 @@ if __name__ == "__main__":
     bench_marginal.main()
     print()
     prices.main()
+    print()
+    bench_mean_field.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()

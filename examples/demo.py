@@ -13,6 +13,7 @@ from examples import (
     banana,
     bee_dance,
     bimodal_mixture,
+    bioassay,
     ceiling_robot,
     central_limit,
     corridor_doors,
@@ -40,6 +41,7 @@ from examples import (
     stochastic_volatility,
     three_views,
     van_der_merwe,
+    variational_mixture,
     weight_collapse,
 )
 
@@ -48,9 +50,9 @@ FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
-    banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, coupled_chains, radar_target,
-    bee_dance, gnp_trend_cycle,
+    banana, bioassay, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
+    landmark_localization, range_only, coupled_chains, radar_target, bee_dance, gnp_trend_cycle,
+    variational_mixture,
 )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.mutants import (
+    approximate,
     chains,
     densities,
     draws,
@@ -12,15 +13,18 @@ from tests.mutants import (
     hamiltonian,
     slices,
     switching,
+    variational,
 )
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
+    *approximate.MUTANTS,
     *chains.MUTANTS,
     *draws.MUTANTS,
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *variational.MUTANTS,
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *slices.MUTANTS,
