@@ -21,7 +21,7 @@ from bayesmc.errors import ConvergenceWarning, UnsupportedError
 from bayesmc.testing import session
 from tests.matrix import KINDS, SHIFT, exact, problem, quiet_check
 
-NETS = session.scaled(12, 10)
+NETS = session.scaled(7, 15)
 
 
 @dataclass(frozen=True)
