@@ -13,7 +13,7 @@ import pytest
 from scipy.special import i0e
 
 import bayesmc as bmc
-from bayesmc.errors import ConvergenceWarning, UnsupportedError
+from bayesmc.errors import ConvergenceWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.testing import compare, gaussian_evidence, random_gaussian_net, session
 from bayesmc.testing.verdict import NothingToCompare
 
@@ -79,6 +79,15 @@ def test_evidence_has_the_factors_that_nothing_hidden_moves() -> None:
     assert asked(net, evidence).log_marginal_likelihood == pytest.approx(
         exact.log_marginal_likelihood, abs=1e-10
     )
+
+
+def test_evidence_that_nothing_hidden_makes_possible_is_refused_by_name() -> None:
+    net = bmc.BayesNet()
+    net.add("coin", bmc.Categorical([1.0, 0.0]))
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    with pytest.raises(ZeroProbabilityError, match="'coin'"):
+        asked(net, {"coin": 1, "y": 0.3})
 
 
 # ---- against figures that others publish, and sampling --------------------------------------------
