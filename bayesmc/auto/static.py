@@ -15,6 +15,7 @@ from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
+from bayesmc.engines.propagation.static import MessageEngine
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
@@ -114,7 +115,7 @@ def explained(
     if type(chosen).__name__ in refused:
         return Explanation(chosen, tuple(reasons), refused)
     nodes, table = chosen.describe(problem), tuple(chosen.table(problem))
-    effort = chosen.effort(problem) if isinstance(chosen, ChainEngine) else ""
+    effort = chosen.effort(problem) if isinstance(chosen, (ChainEngine, MessageEngine)) else ""
     return Explanation(chosen, tuple(reasons), refused, nodes, table, effort)
 
 
@@ -183,7 +184,7 @@ def _checked(engine: Any) -> Any:
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"
         )
-    if isinstance(engine, FilterEngine):
+    if isinstance(engine, FilterEngine) and not isinstance(engine, Engine):
         raise TypeError(
             f"engine={type(engine).__name__}(...) answers over time; call filter, smooth, forecast or "
             "most_likely with it, or give infer a static engine (Gibbs(draws), ParticleGibbs(...), ...)"

@@ -200,6 +200,7 @@ def along_line(
             break
     u, log, weight = _on_panels(log_factor, precision, linear, low, high, breaks)
     fine = _summed(u[..., None], log, weight)
+    fine = fine._replace(log=np.where(_ends_in_time(u, log), fine.log, np.nan))
     rough = _summed(*_rough(log_factor, precision, linear, low, high, breaks))
     return fine._replace(error=_difference(fine, rough))
 
@@ -398,6 +399,14 @@ def _window(
     new_low = np.where(order - low < 0.02 * width, low - width, np.maximum(order - gap, low))
     new_high = np.where(high - last < 0.02 * width, high + width, np.minimum(last + gap, high))
     return np.where(none, low - width, new_low), np.where(none, high + width, new_high)
+
+
+def _ends_in_time(u: np.ndarray, log: np.ndarray) -> np.ndarray:
+    """Whether the product is next to nothing at both ends of the window: it may have no integral."""
+    log = np.where(np.isnan(log), -np.inf, log)
+    top = log.max(axis=0)
+    ends = [np.take_along_axis(log, f(u, axis=0)[None], axis=0)[0] for f in (np.argmin, np.argmax)]
+    return np.maximum(*ends) < top - 0.4 * _REACH
 
 
 def _summed(u: np.ndarray, log: np.ndarray, weight: np.ndarray) -> Tilt:

@@ -86,6 +86,8 @@ class Batch:
         Whether it is the density of coordinates that it reads.
     elements : ndarray of int, shape (count,)
         Which elements of the node's plates they are.
+    index : ndarray of int, shape (count,), optional
+        Which of the kernel's factors they are.
     """
 
     name: str
@@ -99,6 +101,7 @@ class Batch:
     weights: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 0)))
     is_prior: bool = False
     elements: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    index: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         k = self.weights.shape[1] if self.block >= 0 else 0
@@ -123,7 +126,6 @@ class Batch:
         fine = np.isfinite(found.log) & (found.log > NOTHING)
         self.error = max(self.error, found.error)
         skipped = int((~fine).sum())
-        self.logs[at] = found.constant
         step = share if self.k else 1.0 if share > 0.5 else share
         for end, edge in enumerate(self.edges):
             new = clipped(found.tables[end] - found.cavities[end])
@@ -138,6 +140,7 @@ class Batch:
                 np.add.at(logs, edge.at[at], change)
         if self.k:
             skipped += self._moved(beliefs, at, found, fine, share)
+        self.logs[at] = self._constants(found, at)
         return Outcome(skipped, found.error)
 
     def begin(self, beliefs: Beliefs, mean: np.ndarray, cov: np.ndarray) -> None:
@@ -148,7 +151,7 @@ class Batch:
 
     def constants(self, beliefs: Beliefs) -> np.ndarray:
         """Logs by which factors exceed their messages, given beliefs as they are."""
-        return self._tilted(beliefs, self.everyone).constant
+        return self._constants(self._tilted(beliefs, self.everyone), self.everyone)
 
     def joint(self, beliefs: Beliefs, member: int) -> np.ndarray:
         """Joint probabilities of one factor's finite variables, shape its cards."""
@@ -177,11 +180,12 @@ class Batch:
             size = np.abs(own).max(axis=(-2, -1), keepdims=True)
             precision = np.where(np.abs(precision) < _ROUNDING * size, 0.0, precision)
             with np.errstate(all="ignore"):
-                tilt = self.kernel.tilted(at, precision, linear, near)
+                tilt = self.kernel.tilted(self._index(at), precision, linear, near)
         else:
             empty = np.zeros((len(at), 0, 0))
-            tilt = self.kernel.tilted(at, empty, empty[..., 0], (empty[..., 0], empty))
-            precision, linear = empty, empty[..., 0]
+            none = np.zeros((len(at), 0))
+            tilt = self.kernel.tilted(self._index(at), empty, none, (none, empty))
+            precision, linear = empty, none
         joint = np.broadcast_to(tilt.log + outer, (len(at), *self.cards)) if self.cards else tilt.log
         possible = outer > NOTHING
         joint = np.where(possible, joint, np.where(np.isnan(joint), -np.inf, joint))
@@ -191,17 +195,26 @@ class Batch:
         for end in range(len(self.edges)):
             turned = np.moveaxis(joint, 1 + end, 1).reshape(len(at), self.cards[end], -1)
             tables.append(log_sum(turned))
-        constant = log - sum(
-            (log_sum(c + t[at]) for c, t in zip(cavities, self.tables, strict=True)), np.zeros(len(at))
-        )
         mean = cov = np.zeros((len(at), 0))
         if self.k:
-            constant = constant - log_integral(precision + self.precision[at], linear + self.linear[at])
             states = flat.shape[1]
             means = np.broadcast_to(tilt.mean, (*joint.shape, self.k)).reshape(len(at), states, self.k)
             covs = np.broadcast_to(tilt.cov, (*joint.shape, self.k, self.k))
             _, mean, cov = mixed(flat, means, covs.reshape(len(at), states, self.k, self.k))[:3]
-        return _Found(log, tables, cavities, joint, constant, precision, linear, mean, cov, tilt.error)
+        return _Found(log, tables, cavities, joint, precision, linear, mean, cov, tilt.error)
+
+    def _index(self, at: np.ndarray) -> np.ndarray:
+        return at if self.index is None else self.index[at]
+
+    def _constants(self, found: _Found, at: np.ndarray) -> np.ndarray:
+        """Logs by which factors exceed their messages, with the cavities that were found."""
+        logs = found.log.copy()
+        for cavity, table in zip(found.cavities, self.tables, strict=True):
+            logs -= log_sum(cavity + table[at])
+        if self.k:
+            own = found.precision + self.precision[at]
+            logs -= log_integral(own, found.linear + self.linear[at])
+        return logs
 
     def _projected(self, blocks: Blocks, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of the directions of some factors."""
@@ -285,7 +298,6 @@ class _Found(NamedTuple):
     tables: Sequence[np.ndarray]
     cavities: Sequence[np.ndarray]
     joint: np.ndarray
-    constant: np.ndarray
     precision: np.ndarray
     linear: np.ndarray
     mean: np.ndarray

@@ -16,7 +16,8 @@ from scipy import special
 
 from bayesmc.distributions import Bernoulli, Distribution
 from bayesmc.engines.propagation.coordinates import Numbers
-from bayesmc.engines.propagation.kernels import Density, Probit
+from bayesmc.engines.propagation.beliefs import IMPOSSIBLE
+from bayesmc.engines.propagation.kernels import Density, Probit, Tables
 from bayesmc.engines.propagation.scopes import basis
 from bayesmc.errors import BudgetError, TraceError, UnsupportedError
 from bayesmc.expression import (
@@ -51,7 +52,7 @@ class Read:
     Attributes
     ----------
     name : str
-    kernel : Density or Probit
+    kernel : Density, Probit or Tables
     scope : tuple of ndarray of int
         For every finite variable of a factor, which node's element it is: (node, elements).
     coordinates : ndarray of int, shape (count, m)
@@ -60,7 +61,7 @@ class Read:
     """
 
     name: str
-    kernel: Density | Probit
+    kernel: Density | Probit | Tables
     scope: tuple[tuple[str, np.ndarray], ...]
     coordinates: np.ndarray
     weights: np.ndarray
@@ -128,6 +129,13 @@ class Terms:
         for called, form in zip(inner.names, inner.combinations, strict=True):
             _hold_aligned(inner.residual, called, form, shape)
         scope, values, cards = self._configured(name, plates, parents, inner.residual, inner.combinations)
+        places = tuple((n, own[at]) for n, own in scope)
+        if not inner.combinations:
+            (logs,) = Program([inner.residual])(values)
+            wide = _spread(logs, (*cards, *shape), len(shape)).reshape(*cards, -1)[..., at]
+            kernel = Tables(np.maximum(np.moveaxis(wide, -1, 0), IMPOSSIBLE))
+            none = np.zeros((len(at), 0))
+            return Read(name, kernel, places, none.astype(int), none[:, None], at)
         offset, gain, coordinates = self._coefficients(inner.combinations, values, cards, shape, at)
         states, d = math.prod(cards), offset.shape[-1]
         m = coordinates.shape[-1]
@@ -140,12 +148,9 @@ class Terms:
         leaves = {
             n: f.offset.shape for n, f in zip(inner.names, inner.combinations, strict=True)
         }
-        kernel = Density(
-            program, leaves, values, cards, shape, offset, within, at, len(zero)
-        )  # fmt: skip
-        self._hold(name, kernel, root, coordinates, weights, cards, shape, values)
-        places = tuple((n, places[at]) for n, places in scope)
-        return Read(name, kernel, places, coordinates, weights, at)
+        factors = Density(program, leaves, values, cards, shape, offset, within, at, len(zero))
+        self._hold(name, factors, root, coordinates, weights, cards, shape, values)
+        return Read(name, factors, places, coordinates, weights, at)
 
     def _result(self, name: str) -> Any:
         found = density(self.model, name, self.cut)

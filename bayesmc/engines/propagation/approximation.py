@@ -1,0 +1,168 @@
+"""Where messages ended, as a distribution: Gaussian components and finite variables side by side."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import special
+
+from bayesmc.distributions import Distribution, Normal
+from bayesmc.distributions.transforms import Transform
+from bayesmc.engines.approximate.approximation import Drawn, Marginal
+from bayesmc.engines.propagation.beliefs import normalised
+from bayesmc.engines.propagation.coordinates import Numbers
+from bayesmc.engines.propagation.system import System
+
+#: points of Gauss and Hermite for moments of mapped numbers
+_POINTS = 96
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """Numbers between bounds whose free numbers are normal.
+
+    Attributes
+    ----------
+    transform : Transform
+    centre, spread : ndarray, shape (*plates, *event)
+        Of the free numbers.
+    seen : ndarray of bool
+        Where they are known.
+    """
+
+    transform: Transform
+    centre: np.ndarray
+    spread: np.ndarray
+
+    @cached_property
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+        x, w = np.polynomial.hermite_e.hermegauss(_POINTS)
+        shape = (-1, *(1,) * self.centre.ndim)
+        values = self.transform.constrain(self.centre + self.spread * x.reshape(shape))
+        weight = (w / w.sum()).reshape(shape)
+        mean = (weight * values).sum(axis=0)
+        return mean, (weight * (values - mean) ** 2).sum(axis=0)
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self._moments[0]
+
+    @property
+    def var(self) -> np.ndarray:
+        return self._moments[1]
+
+    def ppf(self, q: np.ndarray) -> np.ndarray:
+        """Quantiles: the map keeps the order, or turns it round."""
+        up, down = (
+            self.transform.constrain(self.centre + self.spread * special.ndtri(level))
+            for level in (q, 1.0 - np.asarray(q))
+        )
+        rises = self.transform.constrain(self.centre + 1.0) >= self.transform.constrain(self.centre)
+        return np.where(rises, up, down)
+
+
+class Messages:
+    """What ``ApproximatePosterior`` asks of where messages ended.
+
+    Finite variables, and each set of numbers that hang together, are independent of each other in it, whatever they
+    are in the model; numbers of one set are jointly normal in their free coordinates.
+    """
+
+    coordinates = "numbers jointly Gaussian (mapped where bounded), finite nodes each by itself"
+
+    def __init__(self, system: System) -> None:
+        self.model = system.target.model
+        self.names = system.target.chain
+        self._beliefs, self._numbers, self._places = system.beliefs, system.numbers, system.places
+        self._observed = system.target.observed
+
+    def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
+        """Independent joint draws of all nodes in ``names``."""
+        beliefs = self._beliefs
+        free = np.zeros((draws, len(beliefs.size)))
+        log = np.zeros(draws)
+        for k, block in enumerate(beliefs.blocks):
+            mine = np.flatnonzero(beliefs.size == k)
+            root = np.linalg.cholesky(block.cov)
+            noise = rng.standard_normal((draws, *block.linear.shape))
+            value = block.mean + np.matvec(root, noise)
+            free[:, mine] = value[:, beliefs.component[mine], beliefs.place[mine]]
+            log -= 0.5 * (noise**2).sum(axis=(1, 2)) + 0.5 * np.log(2 * np.pi) * noise[0].size
+            log -= np.log(root.diagonal(0, -2, -1)).sum()
+        values = {}
+        for name in self.names:
+            x = self._numbers.get(name)
+            if x is not None:
+                values[name] = x.whole(free)
+                log -= _volume(x, free)
+                continue
+            node = self.model[name]
+            table = normalised(self._logs(name))
+            noise = rng.gumbel(size=(draws, *table.shape))
+            codes = (table + noise).argmax(axis=-1)
+            log += np.take_along_axis(table[None], codes[..., None], axis=-1)[..., 0].sum(axis=-1)
+            assert node.domain is not None
+            values[name] = codes.reshape(draws, *node.plate_shape).astype(node.domain.dtype)
+        return Drawn(values, log)
+
+    def marginal(self, name: str) -> Marginal | None:
+        """Of a node by itself; of simplexes and matrices by draws."""
+        x = self._numbers.get(name)
+        if x is None or x.transform.unconstrained_shape != x.node.event_shape:
+            return None
+        mean, var = self._beliefs.variances(np.maximum(x.at, 0).reshape(-1))
+        shape = x.node.value_shape
+        hidden = (x.at >= 0).reshape(-1)
+        centre = np.where(hidden, mean, x.seen.reshape(-1)).reshape(shape)
+        spread = np.where(hidden, np.sqrt(var), 0.0).reshape(shape)
+        if x.is_plain and hidden.all():
+            found: Distribution = Normal(centre, spread)
+            return found
+        return Mapped(x.transform, centre, spread)
+
+    def probabilities(self, name: str) -> np.ndarray | None:
+        """Probabilities of the states of a finite node."""
+        if name not in self.names:
+            return None
+        node = self.model[name]
+        assert node.domain is not None
+        table = np.exp(normalised(self._logs(name)))
+        return table.reshape(*node.plate_shape, node.domain.size)
+
+    def covariance(self, *names: str) -> np.ndarray | None:
+        """Of numbers that are as they are; others by draws."""
+        parts = [self._numbers.get(n) for n in names]
+        if any(x is None or not x.is_plain for x in parts):
+            return None
+        at = np.concatenate([x.at.reshape(-1) for x in parts if x is not None])
+        _, cov = self._beliefs.moments(np.maximum(at, 0))
+        known = at < 0
+        return np.where(known[:, None] | known, 0.0, cov)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _logs(self, name: str) -> np.ndarray:
+        """Log beliefs of all elements of a finite node."""
+        places = [self._places[name, e] for e in range(math.prod(self.model[name].plate_shape))]
+        if not places:
+            domain = self.model[name].domain
+            assert domain is not None
+            return np.zeros((0, domain.size))
+        return self._beliefs.finite[places[0][0]].logs[[at for _, at in places]]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _volume(x: Numbers, free: np.ndarray) -> np.ndarray:
+    """Log changes of volume of a node's hidden elements, shape (draws,)."""
+    if x.is_plain:
+        return np.zeros(len(free))
+    own = np.where(x.at >= 0, free[:, np.maximum(x.at, 0)], x.seen)
+    shape = x.node.plate_shape + x.transform.unconstrained_shape
+    logs = x.transform.log_abs_det_jacobian(own.reshape(len(free), *shape))
+    logs = np.broadcast_to(logs, (len(free), *x.node.plate_shape)).reshape(len(free), -1)
+    return np.where((x.at >= 0).all(axis=-1), logs, 0.0).sum(axis=-1)
