@@ -112,6 +112,7 @@ class Batch:
         #: logs of the constants by which factors exceed their messages, as of the last visit
         self.logs = np.zeros(self.count)
         self.error = 0.0
+        self._touched = np.unique(self.component)
         self.is_shared = self.block >= 0 and bool(
             (self.component == self.component[:1]).all() and (self.columns == self.columns[:1]).all()
         )
@@ -177,7 +178,7 @@ class Batch:
             own = _inverse(near[1])
             precision = own - self.precision[at]
             linear = np.matvec(own, near[0]) - self.linear[at]
-            size = np.abs(own).max(axis=(-2, -1), keepdims=True)
+            size = np.abs(own).max(axis=(-2, -1), keepdims=True) if self.k > 1 else own
             precision = np.where(np.abs(precision) < _ROUNDING * size, 0.0, precision)
             with np.errstate(all="ignore"):
                 tilt = self.kernel.tilted(self._index(at), precision, linear, near)
@@ -186,7 +187,11 @@ class Batch:
             none = np.zeros((len(at), 0))
             tilt = self.kernel.tilted(self._index(at), empty, none, (none, empty))
             precision, linear = empty, none
-        joint = np.broadcast_to(tilt.log + outer, (len(at), *self.cards)) if self.cards else tilt.log
+        if not self.edges:
+            return _Found(
+                tilt.log, (), (), tilt.log, precision, linear, tilt.mean, tilt.cov, tilt.error
+            )
+        joint = np.broadcast_to(tilt.log + outer, (len(at), *self.cards))
         possible = outer > NOTHING
         joint = np.where(possible, joint, np.where(np.isnan(joint), -np.inf, joint))
         flat = joint.reshape(len(at), -1)
@@ -218,7 +223,7 @@ class Batch:
 
     def _projected(self, blocks: Blocks, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of the directions of some factors."""
-        weights = self.weights[at]
+        weights = self.weights if at is self.everyone else self.weights[at]
         if self.is_shared:
             c, columns = self.component[0], self.columns[0]
             cov = blocks.cov[c][np.ix_(columns, columns)]
@@ -230,24 +235,24 @@ class Batch:
             mean = np.matvec(weights, blocks.mean[c, columns])
             turned = weights @ blocks.cov[c[..., None], columns[:, :, None], columns[:, None, :]]
         if self.k == 1:
-            return mean, np.vecdot(turned, weights)[..., None]
+            return mean, np.einsum("fkm,fkm->fk", turned, weights)[..., None]
         return mean, turned @ np.matrix_transpose(weights)
 
     def _add(
         self, blocks: Blocks, at: np.ndarray, precision: np.ndarray, linear: np.ndarray
     ) -> None:
         """Add messages of some factors to their components."""
-        weights = self.weights[at]
+        weights = self.weights if at is self.everyone else self.weights[at]
         if self.is_shared:
             c, columns = self.component[0], self.columns[0]
             if self.k == 1:
                 flat = weights[:, 0]
                 own = flat.T @ (precision[:, 0] * flat)
+                blocks.linear[c, columns] += linear[:, 0] @ flat
             else:
+                blocks.linear[c, columns] += np.einsum("fki,fk->i", weights, linear)
                 own = np.einsum("fki,fkl,flj->ij", weights, precision, weights, optimize=True)
-            rows = blocks.precision[c]
-            rows[np.ix_(columns, columns)] += own
-            blocks.linear[c, columns] += np.einsum("fki,fk->i", weights, linear)
+            blocks.precision[c][np.ix_(columns, columns)] += own
             return
         turned = np.matrix_transpose(weights)
         c, columns = self.component[at][:, None], self.columns[at]
@@ -260,18 +265,15 @@ class Batch:
     ) -> int:
         """Move Gaussian messages as far as components stay proper; how many could not."""
         blocks = beliefs.blocks[self.block]
-        cov = np.where(fine[:, None, None], found.cov, np.eye(self.k))
-        root, bad = try_cholesky(cov)
-        proper = fine & np.isfinite(found.mean).all(axis=-1)
-        if bad is not None:
-            proper &= ~bad
-        own = _inverse(np.where(proper[:, None, None], cov, np.eye(self.k)))
+        proper = fine & np.isfinite(found.mean).all(axis=-1) & _is_definite(found.cov)
+        cov = found.cov if proper.all() else np.where(proper[:, None, None], found.cov, np.eye(self.k))
+        own = _inverse(cov)
         new = own - found.precision
         change = np.where(proper[:, None, None], share * (new - self.precision[at]), 0.0)
         towards = np.matvec(own, found.mean) - found.linear
         move = np.where(proper[:, None], share * (towards - self.linear[at]), 0.0)
         skipped = int((fine & ~proper).sum())
-        touched = np.unique(self.component[at])
+        touched = self._touched if at is self.everyone else np.unique(self.component[at])
         kept = blocks.precision[touched].copy(), blocks.linear[touched].copy()
         for _ in range(8):
             self._add(blocks, at, change, move)
@@ -310,6 +312,14 @@ def _inverse(matrices: np.ndarray) -> np.ndarray:
     if matrices.shape[-1] == 1:
         return 1.0 / matrices
     return np.linalg.inv(matrices)
+
+
+def _is_definite(matrices: np.ndarray) -> np.ndarray:
+    """Which matrices are positive definite."""
+    if matrices.shape[-1] == 1:
+        return matrices[..., 0, 0] > 0
+    _, bad = try_cholesky(np.where(np.isfinite(matrices), matrices, 0.0))
+    return np.ones(len(matrices), dtype=bool) if bad is None else ~bad
 
 
 def _is_unique(places: np.ndarray) -> bool:

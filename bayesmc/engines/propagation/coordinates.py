@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesmc.distributions.transforms import Identity, Transform, transform_of
+from bayesmc.engines.propagation.scores import NormalScores, scores_of
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import (
     Constant,
@@ -26,7 +27,7 @@ from bayesmc.expression import (
     leaf,
 )
 from bayesmc.expression.functions import expression_of
-from bayesmc.network import CompiledNode, Observed
+from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.passes.arithmetic import rewritten
 from bayesmc.structure.reading import hidden_elements
 
@@ -54,6 +55,11 @@ class Numbers:
     def is_plain(self) -> bool:
         """Whether coordinates are the node's own numbers."""
         return isinstance(self.transform, Identity)
+
+    @property
+    def is_score(self) -> bool:
+        """Whether coordinates are normal scores, whose prior is exact."""
+        return isinstance(self.transform, NormalScores)
 
     @property
     def leaf(self) -> Expression:
@@ -116,7 +122,7 @@ _TURNED = {
 
 
 def numbers_of(
-    nodes: Sequence[CompiledNode], observed: Mapping[str, Observed]
+    model: Model, nodes: Sequence[CompiledNode], observed: Mapping[str, Observed]
 ) -> dict[str, Numbers]:
     """Coordinates of some hidden continuous nodes, one after the other.
 
@@ -144,6 +150,8 @@ def numbers_of(
                 "nodes of its parts"
             )
         transform = transform_of(node.support, node.event_shape)
+        if not isinstance(transform, Identity):
+            transform = scores_of(model, node.name) or transform
         count, d = math.prod(node.plate_shape), math.prod(transform.unconstrained_shape)
         hidden = hidden_elements(node, seen)
         at = np.full((count, d), -1)

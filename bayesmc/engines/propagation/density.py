@@ -21,7 +21,6 @@ from bayesmc.engines.propagation.kernels import Density, Probit, Tables
 from bayesmc.engines.propagation.scopes import basis
 from bayesmc.errors import BudgetError, TraceError, UnsupportedError
 from bayesmc.expression import (
-    Constant,
     Elementwise,
     Expression,
     Family,
@@ -126,9 +125,9 @@ class Terms:
         root = self._log_factor(name, shape)
         free = {n.leaf.name for n in self.numbers.values()} & root.leaves  # type: ignore[attr-defined]
         inner = directions(_widened(root, frozenset(free)), free)
-        for called, form in zip(inner.names, inner.combinations, strict=True):
-            _hold_aligned(inner.residual, called, form, shape)
         scope, values, cards = self._configured(name, plates, parents, inner.residual, inner.combinations)
+        for called, form in zip(inner.names, inner.combinations, strict=True):
+            _hold_aligned(inner.residual, called, form, shape, values)
         places = tuple((n, own[at]) for n, own in scope)
         if not inner.combinations:
             (logs,) = Program([inner.residual])(values)
@@ -369,19 +368,23 @@ def _widened(root: Expression, wanted: frozenset[str]) -> Expression:
     return rewritten([root], wide)[0]
 
 
-def _hold_aligned(residual: Expression, name: str, form: Affine, shape: tuple[int, ...]) -> None:
-    """Refuse combinations that elements share: each has its own."""
-    own = form.offset.shape
+def _hold_aligned(
+    residual: Expression,
+    name: str,
+    form: Affine,
+    shape: tuple[int, ...],
+    values: Mapping[str, np.ndarray],
+) -> None:
+    """Refuse combinations that elements share: each has its own, whatever finite nodes are."""
+    own, count = form.offset.shape, math.prod(shape)
     if own[: len(shape)] != shape:
         raise TraceError("elements of a plate share what is not affine")
-    count = math.prod(shape)
+    if count == 1:
+        return
     numbers = np.repeat(np.arange(count), math.prod(own) // max(count, 1)).reshape(own)
-    found = element_read(residual, name, numbers)
-    wanted = np.arange(count).reshape(shape)
-    if not isinstance(found, Constant) or not np.isin(found.value - wanted, (0,)).all():
-        is_idle = isinstance(found, Constant) and ((found.value == wanted) | (found.value < 0)).all()
-        if not is_idle:
-            raise TraceError("elements of a plate read each other's numbers")
+    (found,) = Program([element_read(residual, name, numbers)])(values)
+    if not ((found == np.arange(count).reshape(shape)) | (found < 0)).all():
+        raise TraceError("elements of a plate read each other's numbers")
 
 
 def _full(expression: Expression, shape: tuple[int, ...]) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.scopes import Rows
+from bayesmc.engines.propagation.scores import NormalScores
 from bayesmc.errors import UnsupportedError, ZeroProbabilityError
 from bayesmc.factors.gaussian import likelihood_rows
 from bayesmc.network import Model, Observed
@@ -41,6 +42,20 @@ def linear_rows(
     return _rows(reading, observed.get(name), states, numbers)
 
 
+def score_rows(x: Numbers, seen: Observed | None) -> Iterator[Rows]:
+    """The standard normal priors of normal scores, and the densities of elements that are observed."""
+    assert isinstance(x.transform, NormalScores)
+    one, none = np.array([[1.0, 0.0]]), np.zeros((0, 1))
+    values = None if seen is None else np.broadcast_to(seen.value, x.node.value_shape).reshape(-1)
+    for e, at in enumerate(x.at):
+        if at[0] >= 0:
+            scale = np.array(-0.5 * np.log(2.0 * np.pi))
+            yield Rows(x.node.name, e, (), at, one, scale, True)
+        elif values is not None:
+            log = np.asarray(x.transform.prior.log_prob(values[e]))
+            yield Rows(x.node.name, e, (), np.zeros(0, dtype=int), none, log, False)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -60,6 +75,8 @@ def _rows(
     values = None if seen is None else seen.value.reshape(reading.count, d)
     _refuse_invalid(reading)
     for e in range(reading.count):
+        if e in hidden and name not in numbers:
+            continue  # drawn afterwards
         given = reading.conditional(e, states)
         at = [numbers[b].at[k] for b, k in given.parents]
         if e in hidden:

@@ -165,6 +165,8 @@ def _treated(problem: Problem, system: System, name: str) -> str:
         x = system.numbers[name]
         kind = "jointly Gaussian" if x.is_plain else "jointly Gaussian after a map to the line"
         prior = f"prior by {own}" if own else "linear-Gaussian prior, exact"
+        if x.is_score:
+            kind, prior = "jointly Gaussian in normal scores", "prior exact"
         return f"{kind}; {prior}"
     if name in system.target.chain:
         return f"probabilities of its states; {own or 'no factor of its own'}"

@@ -21,7 +21,7 @@ from bayesmc.engines.propagation.beliefs import IMPOSSIBLE, Beliefs, components
 from bayesmc.engines.propagation.coordinates import Numbers, numbers_of
 from bayesmc.engines.propagation.density import Read, Terms
 from bayesmc.engines.propagation.kernels import Switched, Tables
-from bayesmc.engines.propagation.linear import linear_rows
+from bayesmc.engines.propagation.linear import linear_rows, score_rows
 from bayesmc.engines.propagation.scopes import Rows, basis, padded
 from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.expression import Family
@@ -144,7 +144,7 @@ def _assembled(problem: Problem, target: Target, who: str) -> System:
     known = {**known_values(model, constants_of(model, problem.inputs), observed)}
     known.update({n: o.value for n, o in observed.items() if o.mask is None})
     chain = [model[n] for n in target.chain]
-    numbers = numbers_of([n for n in chain if n.domain is None], observed)
+    numbers = numbers_of(model, [n for n in chain if n.domain is None], observed)
     finite = _finite(model, target, known, numbers)
     states = {
         (n, int(e)): int(o.value.flat[e])
@@ -159,6 +159,9 @@ def _assembled(problem: Problem, target: Target, who: str) -> System:
         above = _numbers_above(model, name, numbers)
         if not above and name not in numbers and (name not in model.nodes or _is_tabled(target, name)):
             tabled.add(name)
+            continue
+        if name in numbers and numbers[name].is_score:
+            parts += score_rows(numbers[name], observed.get(name))
             continue
         rows = None
         if name in model.nodes and model[name].domain is None and not model[name].is_discrete:
@@ -225,6 +228,8 @@ def _tables(
     model, observed = problem.model, problem.observed
     read = {n for t in target.terms for n in model.above(model.parents(t), lambda n: not model[n].is_stochastic)}
     wanted = tabled | {n for n in finite if model[n].kind == "deterministic" and n in read}
+    if not wanted:
+        return []
     everything = [*model.nodes, *model.potentials]
     without = frozenset(n for n in everything if n not in wanted)
     net = discrete_net(model, observed, problem.inputs, without)
