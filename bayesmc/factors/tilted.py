@@ -1,9 +1,9 @@
 """A factor times a Gaussian cavity: the integral, the mean and the covariance, many at a time.
 
-Cavities come in natural parameters, ``exp(linear' u - u' precision u / 2)`` against ``du``, and need no integral of
-their own: only the product must have one. Where a pair of families has closed forms they are here; for others
-there are panels of Gauss and Legendre between the points where the factor jumps or bends, and lattices in
-two and three dimensions.
+Cavities come in natural parameters, ``exp(linear' u - u' precision u / 2)`` against ``du``, and need no
+integral of their own: only the product must have one. Where a pair of families has closed forms they are
+here; for others there are panels of Gauss and Legendre between the points where the factor jumps or bends,
+and lattices in two and three dimensions.
 
 References
 ----------
@@ -243,7 +243,9 @@ def on_lattice(
         log = log_factor(u) + np.vecdot(linear, u) - 0.5 * np.vecdot(u, np.matvec(precision, u))
         scale = np.log(root.diagonal(0, -2, -1)).sum(axis=-1) + k * np.log(widen * step)
         fine = _summed(u, log, np.broadcast_to(scale, log.shape))
-        rough = _summed(u[coarse], log[coarse], np.broadcast_to(scale + k * np.log(2.0), log.shape)[coarse])
+        rough = _summed(
+            u[coarse], log[coarse], np.broadcast_to(scale + k * np.log(2.0), log.shape)[coarse]
+        )
         moved = np.abs(fine.mean - mean) / np.sqrt(np.maximum(cov.diagonal(0, -2, -1), 1e-300))
         bent = np.abs(fine.cov / np.where(cov == 0, 1.0, cov) - 1.0).max(axis=(-2, -1))
         done = np.isnan(fine.log) | ((moved.max(axis=-1) < 0.3) & (bent < 0.5))

@@ -1,8 +1,8 @@
 """Through which affine combinations of some leaves an expression reads them: a factor's own directions.
 
-A logistic likelihood of many coefficients is a function of one number, the affine combination inside. Integrals
-over all coefficients are then integrals over that number, and where the function jumps or bends is a place on
-its line.
+A logistic likelihood of many coefficients is a function of one number, the affine combination inside.
+Integrals over all coefficients are then integrals over that number, and where the function jumps or bends is
+a place on its line.
 """
 
 from __future__ import annotations
@@ -87,7 +87,8 @@ def directions(root: Expression, names: Collection[str]) -> Directions:
     if forms.get(root) is not None:
         outer.append(root)
     instead: dict[Expression, Expression] = {}
-    combinations, called = [], []
+    combinations: list[Affine] = []
+    called: list[str] = []
     for node in dict.fromkeys(outer):
         form = forms[node]
         assert form is not None
@@ -136,7 +137,9 @@ def breaks(root: Expression, names: Collection[str]) -> list[Expression]:
             try:
                 affine(straight, wanted)
             except TraceError as error:
-                raise TraceError(f"np.{function.__name__} of what is not affine ({error})") from error
+                raise TraceError(
+                    f"np.{function.__name__} of what is not affine ({error})"
+                ) from error
             found[straight] = None
     return list(found)
 

@@ -10,6 +10,7 @@ from tests.mutants import (
     factored,
     filters,
     hamiltonian,
+    propagated,
     slices,
     switching,
 )
@@ -22,6 +23,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *filters.MUTANTS,
     *switching.MUTANTS,
     *factored.MUTANTS,
+    *propagated.MUTANTS,
     *hamiltonian.MUTANTS,
     *slices.MUTANTS,
     *densities.MUTANTS,

@@ -67,8 +67,8 @@ class Mapped:
 class Messages:
     """What ``ApproximatePosterior`` asks of where messages ended.
 
-    Finite variables, and each set of numbers that hang together, are independent of each other in it, whatever they
-    are in the model; numbers of one set are jointly normal in their free coordinates.
+    Finite variables, and each set of numbers that hang together, are independent of each other in it,
+    whatever they are in the model; numbers of one set are jointly normal in their free coordinates.
     """
 
     coordinates = "numbers jointly Gaussian (mapped where bounded), finite nodes each by itself"

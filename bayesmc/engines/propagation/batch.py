@@ -23,8 +23,9 @@ _ROUNDING = 1e-13
 class Kernel(Protocol):
     """What a batch asks of its factors."""
 
-    #: how the moments come about, in words
-    how: str
+    @property
+    def how(self) -> str:
+        """How the moments come about, in words."""
 
     def tilted(
         self,
@@ -114,7 +115,8 @@ class Batch:
         self.error = 0.0
         self._touched = np.unique(self.component)
         self.is_shared = self.block >= 0 and bool(
-            (self.component == self.component[:1]).all() and (self.columns == self.columns[:1]).all()
+            (self.component == self.component[:1]).all()
+            and (self.columns == self.columns[:1]).all()
         )
         self.everyone = np.arange(self.count)
 
@@ -203,7 +205,9 @@ class Batch:
         mean = cov = np.zeros((len(at), 0))
         if self.k:
             states = flat.shape[1]
-            means = np.broadcast_to(tilt.mean, (*joint.shape, self.k)).reshape(len(at), states, self.k)
+            means = np.broadcast_to(tilt.mean, (*joint.shape, self.k)).reshape(
+                len(at), states, self.k
+            )
             covs = np.broadcast_to(tilt.cov, (*joint.shape, self.k, self.k))
             _, mean, cov = mixed(flat, means, covs.reshape(len(at), states, self.k, self.k))[:3]
         return _Found(log, tables, cavities, joint, precision, linear, mean, cov, tilt.error)
@@ -266,7 +270,11 @@ class Batch:
         """Move Gaussian messages as far as components stay proper; how many could not."""
         blocks = beliefs.blocks[self.block]
         proper = fine & np.isfinite(found.mean).all(axis=-1) & _is_definite(found.cov)
-        cov = found.cov if proper.all() else np.where(proper[:, None, None], found.cov, np.eye(self.k))
+        cov = (
+            found.cov
+            if proper.all()
+            else np.where(proper[:, None, None], found.cov, np.eye(self.k))
+        )
         own = _inverse(cov)
         new = own - found.precision
         change = np.where(proper[:, None, None], share * (new - self.precision[at]), 0.0)

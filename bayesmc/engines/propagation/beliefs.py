@@ -129,7 +129,7 @@ class Beliefs:
         size = np.searchsorted(sizes, length)[at] if len(of) else np.zeros(0, dtype=int)
         rank = np.zeros(len(of), dtype=int)
         blocks = []
-        for k, n in enumerate(sizes.tolist()):
+        for n in sizes.tolist():
             mine = np.flatnonzero(length == n)
             rank[mine] = np.arange(len(mine))
             blocks.append(Blocks(np.zeros((len(mine), n, n)), np.zeros((len(mine), n))))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -92,7 +93,8 @@ class Numbers:
             if not isinstance(node, Elementwise) or len(new) != 2:
                 return None
             turned = _TURNED.get(node.function)
-            for value, other, compare in ((*new, node.function), (*new[::-1], turned)):
+            first, second = new
+            for value, other, compare in ((first, second, node.function), (second, first, turned)):
                 if not _is_choice(value, self.node.name) or not isinstance(other, Constant):
                     continue
                 if compare in (np.greater, np.greater_equal) and (other.value <= low.min()).all():
@@ -115,7 +117,7 @@ class Numbers:
         return free.reshape(len(values), *self.at.shape)
 
 
-_TURNED = {
+_TURNED: dict[Any, Any] = {
     np.greater: np.less, np.greater_equal: np.less_equal,
     np.less: np.greater, np.less_equal: np.greater_equal,
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Any density or potential of coordinates and finite variables, read off its expression, as a batch of factors.
+"""Any density or potential of coordinates and finite variables, read off its expression as factors.
 
 Which affine combinations it reads its coordinates through says the pass ``directions``; where it jumps or
 bends along them, ``breaks``. What cannot be read so is refused with the node's name.
@@ -15,8 +15,8 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions import Bernoulli, Distribution
-from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.beliefs import IMPOSSIBLE
+from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.kernels import Density, Probit, Tables
 from bayesmc.engines.propagation.scopes import basis
 from bayesmc.errors import BudgetError, TraceError, UnsupportedError
@@ -125,7 +125,9 @@ class Terms:
         root = self._log_factor(name, shape)
         free = {n.leaf.name for n in self.numbers.values()} & root.leaves  # type: ignore[attr-defined]
         inner = directions(_widened(root, frozenset(free)), free)
-        scope, values, cards = self._configured(name, plates, parents, inner.residual, inner.combinations)
+        scope, values, cards = self._configured(
+            name, plates, parents, inner.residual, inner.combinations
+        )
         for called, form in zip(inner.names, inner.combinations, strict=True):
             _hold_aligned(inner.residual, called, form, shape, values)
         places = tuple((n, own[at]) for n, own in scope)
@@ -144,9 +146,7 @@ class Terms:
         if zero and within.shape[-1] > 1 and d > 1:
             raise TraceError("it jumps or bends in several directions")
         program = Program([inner.residual, *(broadcast(z, _full(z, shape)) for z in zero)])
-        leaves = {
-            n: f.offset.shape for n, f in zip(inner.names, inner.combinations, strict=True)
-        }
+        leaves = {n: f.offset.shape for n, f in zip(inner.names, inner.combinations, strict=True)}
         factors = Density(program, leaves, values, cards, shape, offset, within, at, len(zero))
         self._hold(name, factors, root, coordinates, weights, cards, shape, values)
         return Read(name, factors, places, coordinates, weights, at)
@@ -238,10 +238,10 @@ class Terms:
         unknown = {n for n in unknown if n in model.nodes}
         if unknown:
             raise TraceError(f"it reads {sorted(unknown)[0]!r}, which is not described by messages")
-        entries = math.prod(
-            [float(model[n].domain.size) for n in alone]  # type: ignore[union-attr]
-            + [float(model[n].domain.size) ** math.prod(model[n].plate_shape) for n in whole]  # type: ignore[union-attr]
-        )
+        entries = 1.0
+        for n in names:
+            elements = 1 if n in alone else math.prod(model[n].plate_shape)
+            entries *= float(model[n].domain.size) ** elements  # type: ignore[union-attr]
         count = math.prod(model.sizes[p] for p in plates)
         if entries * count > _ENTRIES:
             raise BudgetError(
@@ -339,9 +339,9 @@ class Terms:
         states = math.prod(cards)
         lead = wanted.shape[: wanted.ndim - len(shape)]
         lead = (1,) * (1 + len(cards) - len(lead)) + lead
-        wanted = np.broadcast_to(
-            wanted.reshape(*lead, *shape), (3, *cards, *shape)
-        ).reshape(3, states, -1)
+        wanted = np.broadcast_to(wanted.reshape(*lead, *shape), (3, *cards, *shape)).reshape(
+            3, states, -1
+        )
         wanted = np.moveaxis(wanted[..., kernel.elements], 1, 2)
         u = np.matvec(weights, points[:, coordinates])
         own = kernel.offset + np.matvec(kernel.gain, u[:, :, None])
@@ -421,5 +421,3 @@ def _unique_rows(places: np.ndarray) -> np.ndarray:
     found[rows, column[rows, at]] = order[rows, at]
     lead = found[:, :1]
     return np.where(found < 0, lead, found)
-
-

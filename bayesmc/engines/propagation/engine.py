@@ -21,14 +21,14 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     """Messages in exponential families, passed until they agree: a fast first answer, on nets and over time.
 
     **On nets** (``infer``) hidden numbers that hang together get one joint Gaussian (those with bounds on the
-    line that they are mapped to), finite nodes a table each. What is linear-Gaussian is entered exactly. Every
-    other factor is approximated by a Gaussian of the few affine combinations through which it reads the
+    line that they are mapped to), finite nodes a table each. What is linear-Gaussian is entered exactly.
+    Every other factor is approximated by a Gaussian of the few affine combinations through which it reads the
     numbers, its own directions, and a table for each of its finite nodes: taken out of the belief, the factor
-    itself multiplied in, and the result replaced by the member of the family with the same moments. These come
-    from closed forms (tables, mixtures of Gaussians, probit), else from quadrature along the direction, with
-    breaks where the factor jumps or bends (comparisons, truncations), or in up to three dimensions; beyond, by
-    importance sampling. ``explain`` says which. On trees of finite nodes it is belief propagation, and exact;
-    on loopy ones it is loopy belief propagation.
+    itself multiplied in, and the result replaced by the member of the family with the same moments. These
+    come from closed forms (tables, mixtures of Gaussians, probit), else from quadrature along the direction,
+    with breaks where the factor jumps or bends (comparisons, truncations), or in up to three dimensions;
+    beyond, by importance sampling. ``explain`` says which. On trees of finite nodes it is belief propagation,
+    and exact; on loopy ones it is loopy belief propagation.
 
     **Over time** (``smooth``, ``filter``, ``forecast``) it takes the templates that ``SwitchingKalmanFilter``
     takes: finite modes, and numbers that are linear-Gaussian given them. Every slice has a belief with one
@@ -36,8 +36,8 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
 
     Answers are approximate, the log marginal likelihood included, and nobody knows by how much;
     ``posterior.check()`` tells. Known to fail: posteriors of several hills, of which it takes one or the
-    mean, and dependence between finite nodes and numbers, which its answer does not hold. Messages need not settle:
-    then there is a ``ConvergenceWarning`` that says by how much beliefs still change.
+    mean, and dependence between finite nodes and numbers, which its answer does not hold. Messages need not
+    settle: then there is a ``ConvergenceWarning`` that says by how much beliefs still change.
 
     Parameters
     ----------
@@ -71,9 +71,9 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     References
     ----------
     Minka (2001), A family of algorithms for approximate Bayesian inference, PhD thesis, MIT; Minka (2004),
-    Power EP (evidence); Heskes and Zoeter (2002), Expectation propagation for approximate inference in dynamic
-    Bayesian networks, UAI 18; Zoeter and Heskes (2005), Change point problems in linear dynamical systems, JMLR
-    6; Herbrich, Minka and Graepel (2006), TrueSkill, NIPS 19.
+    Power EP (evidence); Heskes and Zoeter (2002), Expectation propagation for approximate inference in
+    dynamic Bayesian networks, UAI 18; Zoeter and Heskes (2005), Change point problems in linear dynamical
+    systems, JMLR 6; Herbrich, Minka and Graepel (2006), TrueSkill, NIPS 19.
 
     Examples
     --------
@@ -99,7 +99,10 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     """
 
     def unsupported(
-        self, net: Any, evidence: Mapping[str, Any] | None = None, inputs: Mapping[str, Any] | None = None
+        self,
+        net: Any,
+        evidence: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, Any] | None = None,
     ) -> str | None:
         """Why this engine cannot answer, or None."""
         from_time = isinstance(net, DynamicBayesNet)
@@ -125,11 +128,15 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     def doubt(self, end: Settled) -> str | None:
         if end.converged:
             return None
-        out = f", and left out {end.open} improper messages ({end.skipped} in all)" if end.open else ""
+        out = (
+            f", and left out {end.open} improper messages ({end.skipped} in all)"
+            if end.open
+            else ""
+        )
         return (
-            f"ExpectationPropagation: messages have not settled after {end.sweeps} sweeps: the last one changed a "
-            f"belief by {end.change:.2g} (tolerance {float(self.tolerance):.2g}){out}. Give more damping than "
-            f"{1.0 - end.share:.2g} or more sweeps, or take Gibbs"
+            f"ExpectationPropagation: messages have not settled after {end.sweeps} sweeps: the last one "
+            f"changed a belief by {end.change:.2g} (tolerance {float(self.tolerance):.2g}){out}. Give more "
+            f"damping than {1.0 - end.share:.2g} or more sweeps, or take Gibbs"
         )
 
     # ---- private -------------------------------------------------------------------------------
@@ -141,13 +148,13 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
 
 @dataclass(frozen=True)
 class AssumedDensity(MessageEngine):
-    """One pass of expectation propagation: every factor once, one after the other, in the order of declaration.
+    """One pass of expectation propagation: every factor once, in the order of declaration.
 
-    Each factor is multiplied into the belief so far, which is then replaced by the member of its family with the
-    same moments, and never seen again. So the answer depends on the order of declaration (of a plate, that of
-    its elements), and is mostly further off than that of ``ExpectationPropagation``, which goes on until
-    messages agree. What is linear-Gaussian is entered exactly, at once. Its answers are approximate, and
-    ``posterior.check()`` tells by how much.
+    Each factor is multiplied into the belief so far, which is then replaced by the member of its family with
+    the same moments, and never seen again. So the answer depends on the order of declaration (of a plate,
+    that of its elements), and is mostly further off than that of ``ExpectationPropagation``, which goes on
+    until messages agree. What is linear-Gaussian is entered exactly, at once. Its answers are approximate,
+    and ``posterior.check()`` tells by how much.
 
     References
     ----------
@@ -172,6 +179,6 @@ class AssumedDensity(MessageEngine):
         if not end.open:
             return None
         return (
-            f"AssumedDensity: {end.open} factors have no integral with the belief so far and were left out; take "
-            "ExpectationPropagation or Gibbs"
+            f"AssumedDensity: {end.open} factors have no integral with the belief so far and were left out; "
+            "take ExpectationPropagation or Gibbs"
         )

@@ -92,8 +92,8 @@ class Probit:
         linear: np.ndarray,
         near: tuple[np.ndarray, np.ndarray],
     ) -> Tilt:
-        parts = (a[members] for a in (self.sign, self.offset, self.gain))
-        return probit(*parts, precision[:, 0, 0], linear[:, 0])
+        sign, offset, gain = (a[members] for a in (self.sign, self.offset, self.gain))
+        return probit(sign, offset, gain, precision[:, 0, 0], linear[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -265,5 +265,3 @@ class Density:
             wide = np.broadcast_to(root.reshape(*lead, *self.plates), (*batch, *self.plates))
             found.append(np.moveaxis(wide.reshape(len(u), states, count)[:, :, at], 2, 1))
         return found
-
-

@@ -100,5 +100,3 @@ def _refuse_invalid(reading: Reading) -> None:
             f"ExpectationPropagation: node {name!r} has bad parameters at some states of "
             f"{', '.join(repr(n) for n, _ in scope)}"
         )
-
-

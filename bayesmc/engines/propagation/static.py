@@ -1,4 +1,4 @@
-"""What expectation propagation and its one pass share as engines of nets: refusals, what ``explain`` says, runs."""
+"""What expectation propagation and its one pass share on nets: refusals, what ``explain`` says, runs."""
 
 from __future__ import annotations
 
@@ -54,7 +54,12 @@ class PropagatedPosterior(ApproximatePosterior):
 
     @classmethod
     def of(
-        cls, problem: Problem, engine: Any, system: System, end: Settled, seed: np.random.SeedSequence
+        cls,
+        problem: Problem,
+        engine: Any,
+        system: System,
+        end: Settled,
+        seed: np.random.SeedSequence,
     ) -> PropagatedPosterior:
         found = cls(problem, engine, Messages(system), seed, float(end.log_total))
         found.converged, found.change, found.sweeps = end.converged, end.change, end.sweeps
@@ -101,14 +106,20 @@ class MessageEngine(Engine):
                 kinds[batch.kernel.how] += batch.count
         parts = [f"{n} by {how}" for how, n in kinds.items()]
         if tables:
-            kind = "loopy belief propagation" if system.loops else "belief propagation on trees, exact"
+            kind = (
+                "loopy belief propagation" if system.loops else "belief propagation on trees, exact"
+            )
             parts.append(f"{tables} tables ({kind})")
-        told = ", ".join(parts) if parts else "nothing: all is linear-Gaussian, and the answer is exact"
+        told = (
+            ", ".join(parts)
+            if parts
+            else "nothing: all is linear-Gaussian, and the answer is exact"
+        )
         if system.is_exact:
             return f"factors: {told}"
         return (
-            f"factors approximated: {told}; messages are passed until they agree, and the bias of the answer, "
-            "the log marginal likelihood included, is not known: posterior.check() tells"
+            f"factors approximated: {told}; messages are passed until they agree, and the bias of the "
+            "answer, the log marginal likelihood included, is not known: posterior.check() tells"
         )
 
     def run(
@@ -130,8 +141,8 @@ class MessageEngine(Engine):
             warnings.warn(doubt, ConvergenceWarning, stacklevel=3)
         if end.error > _ROUGH:
             warnings.warn(
-                f"{name}: moments of some factors are rough: coarser rules differ by {end.error:.2g} (logs and "
-                "standard deviations); hold the answer against posterior.check() or Gibbs",
+                f"{name}: moments of some factors are rough: coarser rules differ by {end.error:.2g} (logs "
+                "and standard deviations); hold the answer against posterior.check() or Gibbs",
                 ConvergenceWarning,
                 stacklevel=3,
             )
