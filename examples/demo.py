@@ -14,6 +14,7 @@ from examples import (
     bimodal_mixture,
     ceiling_robot,
     central_limit,
+    clutter,
     corridor_doors,
     coupled_chains,
     diagnosis,
@@ -30,6 +31,7 @@ from examples import (
     old_faithful,
     parzen,
     picture,
+    probit_regression,
     pushforward,
     range_only,
     rejection_and_importance,
@@ -37,6 +39,7 @@ from examples import (
     stochastic_volatility,
     switching_target,
     three_views,
+    trueskill,
     van_der_merwe,
     weight_collapse,
 )
@@ -46,6 +49,7 @@ FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
+    clutter, trueskill, probit_regression,
     banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
     landmark_localization, range_only, coupled_chains, switching_target,
 )  # fmt: skip

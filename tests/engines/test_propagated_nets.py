@@ -1,4 +1,4 @@
-"""Expectation propagation and assumed-density filtering on nets, against fixed points, exact answers and peers."""
+"""Expectation propagation and assumed-density filtering on nets, against fixed points and exact answers."""
 
 from __future__ import annotations
 

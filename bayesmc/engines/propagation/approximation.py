@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -77,7 +78,6 @@ class Messages:
         self.model = system.target.model
         self.names = system.target.chain
         self._beliefs, self._numbers, self._places = system.beliefs, system.numbers, system.places
-        self._observed = system.target.observed
 
     def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
         """Independent joint draws of all nodes in ``names``."""
@@ -141,6 +141,12 @@ class Messages:
         _, cov = self._beliefs.moments(np.maximum(at, 0))
         known = at < 0
         return np.where(known[:, None] | known, 0.0, cov)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        model = self.model.without_functions()
+        numbers = {n: replace(x, node=model[n]) for n, x in self._numbers.items()}
+        return {**self.__dict__, "model": model, "_numbers": numbers}
 
     # ---- private -------------------------------------------------------------------------------
 

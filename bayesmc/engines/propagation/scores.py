@@ -36,6 +36,15 @@ class NormalScores(Transform):
     prior: Distribution
     inverse: Callable[[np.ndarray], np.ndarray]
 
+    @classmethod
+    def of(cls, prior: Distribution) -> NormalScores:
+        """Of a distribution of one number with known parameters."""
+        numbers = [float(getattr(prior, k)) for k in type(prior).parameter_ndim]
+        return cls((), prior, _INVERSES[type(prior)](*numbers))
+
+    def __reduce__(self) -> Any:
+        return NormalScores.of, (self.prior,)
+
     def formula(self, u: Any) -> Any:
         if isinstance(u, TracedArray):
             return TracedArray(elementwise(self.inverse, u.expression))
@@ -74,14 +83,12 @@ def scores_of(model: Model, name: str) -> NormalScores | None:
             return None
         values = {k: v for k, v in values.items() if v is not None}
         prior = prior.make(**{k: _single(v) for k, v in values.items()})
-    make = _INVERSES.get(type(prior))
-    if make is None:
+    if type(prior) not in _INVERSES:
         return None
     numbers = [_single(getattr(prior, k)) for k in type(prior).parameter_ndim]
     if any(np.ndim(n) for n in numbers):
         return None
-    plain = type(prior)(*(float(n) for n in numbers))
-    return NormalScores((), plain, make(*(float(n) for n in numbers)))
+    return NormalScores.of(type(prior)(*(float(n) for n in numbers)))
 
 
 # ---- private ------------------------------------------------------------------------------------
