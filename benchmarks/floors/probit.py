@@ -32,7 +32,8 @@ def one_by_one(
     tau, nu = np.zeros(rows), np.zeros(rows)
     cov, mean = np.eye(columns), np.zeros(columns)
     done = 0
-    for done in range(1, most + 1):
+    while done < most:
+        done += 1
         before = mean
         for i in range(rows):
             x = design[i]
@@ -67,7 +68,8 @@ def in_parallel(
     tau, nu = np.zeros(rows), np.zeros(rows)
     cov, mean = np.eye(columns), np.zeros(columns)
     done = 0
-    for done in range(1, most + 1):
+    while done < most:
+        done += 1
         before = mean
         v, m = ((design @ cov) * design).sum(axis=1), design @ mean
         precision, linear = 1 / v - tau, m / v - nu

@@ -361,13 +361,17 @@ def test_one_coefficient_against_quadrature() -> None:
         assert posterior.log_marginal_likelihood == pytest.approx(wanted, abs=0.02), kind
 
 
-def test_numbers_between_bounds_have_exact_priors() -> None:
+def coin() -> tuple[bmc.BayesNet, np.ndarray, Any]:
     net = bmc.BayesNet(plates={"trial": 12})
     net.add("p", bmc.Beta(2.0, 3.0))
     net.add("y", lambda p: bmc.Bernoulli(p), plates="trial")
     y = np.array([1, 1, 0, 1, 0, 0, 1, 1, 1, 0, 1, 1])
-    posterior = bmc.infer(net, {"y": y}, engine=EP())
-    right = stats.beta(2 + y.sum(), 3 + 12 - y.sum())
+    return net, y, stats.beta(2 + y.sum(), 3 + 12 - y.sum())
+
+
+def test_numbers_between_bounds_have_exact_priors() -> None:
+    net, y, right = coin()
+    posterior = bmc.infer(net, {"y": y}, engine=EP(families={"p": "normal"}))
     assert posterior.mean("p") == pytest.approx(right.mean(), abs=0.02 * right.std())
     assert posterior.quantile("p", [0.1, 0.9]) == pytest.approx(
         right.ppf([0.1, 0.9]), abs=0.05 * right.std()
@@ -375,8 +379,68 @@ def test_numbers_between_bounds_have_exact_priors() -> None:
     assert posterior.log_marginal_likelihood == pytest.approx(
         special.betaln(10, 7) - special.betaln(2, 3), abs=0.01
     )
-    barren = bmc.infer(net, {}, engine=EP())
-    assert barren.mean("p") == pytest.approx(0.4, abs=0.03)
+    with pytest.raises(ValueError, match='there is "normal"'):
+        EP(families={"p": "beta"})
+    with pytest.raises(UnsupportedError, match="no continuous node"):
+        bmc.infer(net, {"y": y}, engine=EP(families={"q": "normal"}))
+
+
+def test_families_of_their_own_are_exact_under_conjugate_factors() -> None:
+    net, y, right = coin()
+    posterior = bmc.infer(net, {"y": y}, engine=EP())
+    assert posterior.mean("p") == pytest.approx(right.mean(), abs=1e-12)
+    assert posterior.quantile("p", 0.9) == pytest.approx(right.ppf(0.9), abs=1e-9)
+    wanted = special.betaln(10, 7) - special.betaln(2, 3)
+    assert posterior.log_marginal_likelihood == pytest.approx(wanted, abs=1e-9)
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("rate", bmc.Gamma(2.0, 3.0))
+    net.add("shares", bmc.Dirichlet(np.array([1.0, 2.0, 0.5])))
+    net.add("count", lambda rate: bmc.Poisson(2.0 * rate), plates="i")
+    net.add("wait", lambda rate: bmc.Exponential(rate))
+    net.add("kind", lambda shares: bmc.Categorical(shares), plates="i")
+    seen = {"count": [1, 0, 3, 2], "wait": 0.7, "kind": [0, 0, 2, 1]}
+    posterior = bmc.infer(net, seen, engine=EP())
+    assert posterior.mean("rate") == pytest.approx((2 + 6 + 1) / (3 + 8 + 0.7), abs=1e-10)
+    assert posterior.mean("shares") == pytest.approx(np.array([3.0, 3.0, 1.5]) / 7.5, abs=1e-10)
+    grid = np.linspace(1e-6, 12, 200_001)
+    density = stats.gamma(2, scale=1 / 3).pdf(grid) * grid * np.exp(-0.7 * grid)
+    density *= np.prod([stats.poisson.pmf(k, 2 * grid) for k in seen["count"]], axis=0)
+    shares = special.gammaln([3, 3, 1.5]).sum() - special.gammaln(7.5)
+    shares -= special.gammaln([1, 2, 0.5]).sum() - special.gammaln(3.5)
+    wanted = np.log(integrate.simpson(density, x=grid)) + shares
+    assert posterior.log_marginal_likelihood == pytest.approx(wanted, abs=1e-6)
+    assert posterior.check(rng=0).k == -np.inf  # all weights are equal
+
+
+def test_labels_switch_families_of_their_own() -> None:
+    net = bmc.BayesNet(plates={"k": 3, "i": 12})
+    net.add("rate", bmc.Gamma(np.array([1.0, 4.0, 20.0]), 1.0), plates="k")
+    net.add("weights", bmc.Dirichlet(np.ones(3)))
+    net.add("label", lambda weights: bmc.Categorical(weights), plates="i")
+    net.add("y", lambda rate, label: bmc.Poisson(rate[label]), plates="i")
+    rng = np.random.default_rng(4)
+    y = rng.poisson(np.array([0.5, 5.0, 19.0])[np.arange(12) % 3])
+    posterior = bmc.infer(net, {"y": y}, engine=EP())
+    assert posterior.converged
+    long = bmc.infer(net, {"y": y}, engine=bmc.Gibbs(draws=1500, warmup=300, chains=4), rng=0)
+    for name in ("rate", "weights"):
+        off = np.abs(posterior.mean(name) - long.mean(name)) / long.std(name)
+        assert off.max() < 0.2
+        assert posterior.std(name) == pytest.approx(long.std(name), rel=0.15)
+    one = bmc.infer(net, {"y": y}, engine=bmc.AssumedDensity())
+    assert np.abs(one.mean("rate") - posterior.mean("rate")).max() > 1e-3
+    back = pickle.loads(pickle.dumps(posterior))
+    assert (back.mean("rate") == posterior.mean("rate")).all()
+
+
+def test_shares_of_a_plate_do_not_sum_to_one() -> None:
+    """The sum over a plate of Beta nodes is no constant; that over a vector's shares is."""
+    net = bmc.BayesNet(plates={"k": 3})
+    net.add("p", bmc.Beta(2.0, 2.0), plates="k")
+    net.add("y", lambda p: bmc.Categorical(p.array / p.array.sum(axis=-1, keepdims=True)))
+    posterior = bmc.infer(net, {"y": 0}, engine=EP())
+    long = bmc.infer(net, {"y": 0}, engine=bmc.LikelihoodWeighting(20_000), rng=0)
+    assert posterior.mean("p") == pytest.approx(long.mean("p"), abs=0.02)
 
 
 def test_mean_and_scale_of_numbers() -> None:

@@ -13,7 +13,7 @@ from scipy import special
 from bayesmc.distributions import Distribution, Normal
 from bayesmc.distributions.transforms import Transform
 from bayesmc.engines.approximate.approximation import Drawn, Marginal
-from bayesmc.engines.propagation.beliefs import normalised
+from bayesmc.engines.propagation.beliefs import Conjugates, normalised
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.system import System
 
@@ -78,6 +78,7 @@ class Messages:
         self.model = system.target.model
         self.names = system.target.chain
         self._beliefs, self._numbers, self._places = system.beliefs, system.numbers, system.places
+        self._kept = system.kept
 
     def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
         """Independent joint draws of all nodes in ``names``."""
@@ -100,6 +101,14 @@ class Messages:
                 log -= _volume(x, free)
                 continue
             node = self.model[name]
+            if name in self._kept:
+                held, rows = self._held(name)
+                drawn, logs = held.family.draw(rng, held.naturals[rows], draws)
+                values[name] = drawn[..., : 1 if not node.event_shape else None].reshape(
+                    draws, *node.value_shape
+                )
+                log += logs.sum(axis=-1)
+                continue
             table = normalised(self._logs(name))
             noise = rng.gumbel(size=(draws, *table.shape))
             codes = (table + noise).argmax(axis=-1)
@@ -110,6 +119,11 @@ class Messages:
 
     def marginal(self, name: str) -> Marginal | None:
         """Of a node by itself; of simplexes and matrices by draws."""
+        if name in self._kept:
+            held, rows = self._held(name)
+            node = self.model[name]
+            natural = held.naturals[rows].reshape(*node.plate_shape, -1)
+            return held.family.marginal(natural, bool(node.event_shape))
         x = self._numbers.get(name)
         if x is None or x.transform.unconstrained_shape != x.node.event_shape:
             return None
@@ -125,10 +139,9 @@ class Messages:
 
     def probabilities(self, name: str) -> np.ndarray | None:
         """Probabilities of the states of a finite node."""
-        if name not in self.names:
-            return None
         node = self.model[name]
-        assert node.domain is not None
+        if name not in self.names or node.domain is None:
+            return None
         table = np.exp(normalised(self._logs(name)))
         return table.reshape(*node.plate_shape, node.domain.size)
 
@@ -149,6 +162,10 @@ class Messages:
         return {**self.__dict__, "model": model, "_numbers": numbers}
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _held(self, name: str) -> tuple[Conjugates, np.ndarray]:
+        kept = self._kept[name]
+        return self._beliefs.families[kept.field], kept.rows
 
     def _logs(self, name: str) -> np.ndarray:
         """Log beliefs of all elements of a finite node."""

@@ -12,11 +12,13 @@ import numpy as np
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.propagation.batch import Batch, Edge, Kernel
 from bayesmc.engines.propagation.beliefs import IMPOSSIBLE, Beliefs, components
+from bayesmc.engines.propagation.conjugate import ConjugateBatch
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.density import Read
 from bayesmc.engines.propagation.kernels import Switched, Tables
 from bayesmc.engines.propagation.scopes import Rows, basis, padded
-from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.engines.propagation.statistics import Kept, Linear, OwnFamilies
+from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Problem
 from bayesmc.structure import Variable
 from bayesmc.structure.target import Target
@@ -47,6 +49,8 @@ class System:
         Node -> number of its elements that are entered exactly.
     loops : bool
         Whether tables of finite nodes hang together in loops.
+    kept : dict
+        Nodes that keep their own family.
     """
 
     target: Target
@@ -57,11 +61,12 @@ class System:
     log_scale: float
     exact: dict[str, int] = field(default_factory=dict)
     loops: bool = False
+    kept: dict[str, Kept] = field(default_factory=dict)
 
     @property
     def is_exact(self) -> bool:
         """Whether nothing is approximated: all is linear-Gaussian, and tables hang together in trees."""
-        return not self.loops and all(not b.k for b in self.batches)
+        return not self.loops and all(b.is_exact for b in self.batches)
 
 
 class Assembly:
@@ -75,13 +80,16 @@ class Assembly:
         parts: Sequence[Rows | Read],
         tables: Sequence[Table],
         states: Mapping[Variable, int],
+        own: OwnFamilies,
     ) -> None:
+        self.own = own
         self.problem, self.target, self.numbers = problem, target, numbers
         self.model, self.states = problem.model, states
         self.rows = [p for p in parts if isinstance(p, Rows)]
         self.reads = [p for p in parts if isinstance(p, Read)]
         self.tables = [t for t in tables if t[1]]
         self.log_scale = float(sum(t[2] for t in tables if not t[1])) + log_constants(target)
+        self.log_scale += own.log_scale
         self.order = {n: k for k, n in enumerate([*problem.model.nodes, *problem.model.potentials])}
 
     def system(self) -> System:
@@ -100,7 +108,9 @@ class Assembly:
         self.beliefs = Beliefs.of(component, cards, counts)
         self._clamp()
         exact = self._enter_exact()
+        self.beliefs.families = self.own.fields
         batches = [*self._table_batches(), *self._row_batches(), *self._read_batches()]
+        batches += self._own_batches()
         batches.sort(key=lambda b: self.order.get(b.name, -1))
         places = self.places
         found = System(
@@ -112,6 +122,7 @@ class Assembly:
             self.log_scale,
             exact,
             self._has_loops(),
+            self.own.nodes,
         )
         _begin(self.problem, found)
         return found
@@ -124,7 +135,7 @@ class Assembly:
             used.update(dict.fromkeys(scope))
         for row in self.rows:
             used.update(dict.fromkeys(row.scope))
-        for read in self.reads:
+        for read in self._scoped():
             for name, at in read.scope:
                 used.update(dict.fromkeys((name, int(e)) for e in at))
         for name in self.target.chain:
@@ -186,7 +197,7 @@ class Assembly:
         found = []
         for (name, shape), group in groupby(self.tables, key=lambda t: (t[0], t[2].shape)):
             members = list(group)
-            logs = np.maximum(np.stack([t[2] for t in members]), IMPOSSIBLE)
+            logs = self._levelled(np.stack([t[2] for t in members]))
             edges = tuple(self._edge([t[1][k] for t in members]) for k in range(len(shape)))
             found.append(Batch(name, Tables(logs), len(members), edges, shape))
         return found
@@ -209,7 +220,7 @@ class Assembly:
             q = len(first.coordinates)
             if not q:  # of finite variables alone
                 value = rows[..., -1]
-                logs = logs - 0.5 * (value**2).sum(axis=-1)
+                logs = self._levelled(logs - 0.5 * (value**2).sum(axis=-1))
                 found.append(Batch(first.name, Tables(logs), len(members), edges, cards))
                 continue
             coordinates = padded([r.coordinates for r in members])
@@ -227,12 +238,48 @@ class Assembly:
             edges = tuple(self._edge([(name, int(e)) for e in at]) for name, at in read.scope)
             cards = tuple(self._card((name, 0)) for name, _ in read.scope)
             if not read.coordinates.shape[1]:
-                found.append(Batch(read.name, read.kernel, len(read.elements), edges, cards))
+                assert isinstance(read.kernel, Tables)
+                kernel = Tables(self._levelled(read.kernel.logs))
+                found.append(Batch(read.name, kernel, len(read.elements), edges, cards))
                 continue
             found += self._placed(
                 read.name, read.kernel, edges, cards, read.coordinates, read.weights,
                 read.name in self.numbers, read.elements,
             )  # fmt: skip
+        return found
+
+    def _levelled(self, logs: np.ndarray) -> np.ndarray:
+        """Tables with their largest entries at 0; what is taken out goes into the evidence."""
+        top = logs.max(axis=tuple(range(1, logs.ndim)), keepdims=True)
+        if not np.isfinite(top).all():
+            raise ZeroProbabilityError("ExpectationPropagation: the evidence has probability zero")
+        self.log_scale += float(top.sum())
+        return np.maximum(logs - top, IMPOSSIBLE)
+
+    def _scoped(self) -> list[Read | Linear]:
+        """Whatever reads finite variables, but for rows and tables."""
+        return [*self.reads, *self.own.factors.values()]
+
+    def _own_batches(self) -> list[Batch]:
+        found: list[Batch] = []
+        for read in self.own.factors.values():
+            edges = tuple(self._edge([(name, int(e)) for e in at]) for name, at in read.scope)
+            cards = tuple(self._card((name, 0)) for name, _ in read.scope)
+            how = "conjugate in every state" if cards else "conjugate, exact"
+            kernel = Tables(np.zeros(0), how)
+            found.append(
+                ConjugateBatch(
+                    read.name,
+                    kernel,
+                    len(read.at),
+                    edges,
+                    cards,
+                    field=read.field,
+                    at=read.at,
+                    coefficients=read.coefficients,
+                    offsets=read.offsets,
+                )  # fmt: skip
+            )
         return found
 
     def _edge(self, variables: Sequence[Variable]) -> Edge:
@@ -273,11 +320,11 @@ class Assembly:
         index = {v: k for k, v in enumerate(variables)}
         scopes = [t[1] for t in self.tables if len(t[1]) > 1]
         scopes += [r.scope for r in self.rows if len(r.scope) > 1]
-        for read in self.reads:
+        for read in self._scoped():
             if len(read.scope) > 1:
                 scopes += [
                     tuple((n, int(at[k])) for n, at in read.scope)
-                    for k in range(len(read.elements))
+                    for k in range(len(read.scope[0][1]))
                 ]
         total = len(variables) + len(scopes)
         edges = [(len(variables) + k, index[v]) for k, s in enumerate(scopes) for v in set(s)]

@@ -113,6 +113,8 @@ class Batch:
         #: logs of the constants by which factors exceed their messages, as of the last visit
         self.logs = np.zeros(self.count)
         self.error = 0.0
+        #: integrals of what contradicts the belief; of densities there is no telling
+        self.floor = NOTHING if not k else -np.inf
         self._touched = np.unique(self.component)
         self.is_shared = self.block >= 0 and bool(
             (self.component == self.component[:1]).all()
@@ -120,30 +122,24 @@ class Batch:
         )
         self.everyone = np.arange(self.count)
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether its factors are not approximated."""
+        return not self.k
+
     # ---- a visit -------------------------------------------------------------------------------
 
     def visit(self, beliefs: Beliefs, share: float, members: np.ndarray | None = None) -> Outcome:
         """Make messages anew and move the beliefs by ``share`` of the way; improper ones are left out."""
         at = self.everyone if members is None else members
         found = self._tilted(beliefs, at)
-        fine = np.isfinite(found.log) & (found.log > NOTHING)
+        fine = np.isfinite(found.log) & (found.log > self.floor)
         self.error = max(self.error, found.error)
         skipped = int((~fine).sum())
-        step = share if self.k else 1.0 if share > 0.5 else share
-        for end, edge in enumerate(self.edges):
-            new = clipped(found.tables[end] - found.cavities[end])
-            new = np.where(fine[:, None], new, self.tables[end][at])
-            new = self.tables[end][at] + step * (new - self.tables[end][at])
-            change = new - self.tables[end][at]
-            self.tables[end][at] = new
-            logs = beliefs.finite[edge.group].logs
-            if self.count == 1 or _is_unique(edge.at[at]):
-                logs[edge.at[at]] += change
-            else:
-                np.add.at(logs, edge.at[at], change)
+        self._send_tables(beliefs, at, found, fine, share if self.k else _whole(share))
         if self.k:
             skipped += self._moved(beliefs, at, found, fine, share)
-        self.logs[at] = self._constants(found, at)
+        self.logs[at] = self._constants(beliefs, found, at)
         return Outcome(skipped, found.error)
 
     def begin(self, beliefs: Beliefs, mean: np.ndarray, cov: np.ndarray) -> None:
@@ -154,7 +150,7 @@ class Batch:
 
     def constants(self, beliefs: Beliefs) -> np.ndarray:
         """Logs by which factors exceed their messages, given beliefs as they are."""
-        return self._constants(self._tilted(beliefs, self.everyone), self.everyone)
+        return self._constants(beliefs, self._tilted(beliefs, self.everyone), self.everyone)
 
     def joint(self, beliefs: Beliefs, member: int) -> np.ndarray:
         """Joint probabilities of one factor's finite variables, shape its cards."""
@@ -164,7 +160,7 @@ class Batch:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _tilted(self, beliefs: Beliefs, at: np.ndarray) -> _Found:
+    def _tilted(self, beliefs: Beliefs, at: np.ndarray) -> Found:
         """Cavities, and factors times these."""
         cavities = [
             normalised(beliefs.finite[e.group].logs[e.at[at]] - own[at])
@@ -183,14 +179,14 @@ class Batch:
             size = np.abs(own).max(axis=(-2, -1), keepdims=True) if self.k > 1 else own
             precision = np.where(np.abs(precision) < _ROUNDING * size, 0.0, precision)
             with np.errstate(all="ignore"):
-                tilt = self.kernel.tilted(self._index(at), precision, linear, near)
+                tilt = self._product(beliefs, at, precision, linear, near)
         else:
             empty = np.zeros((len(at), 0, 0))
             none = np.zeros((len(at), 0))
-            tilt = self.kernel.tilted(self._index(at), empty, none, (none, empty))
+            tilt = self._product(beliefs, at, empty, none, (none, empty))
             precision, linear = empty, none
         if not self.edges:
-            return _Found(
+            return Found(
                 tilt.log, (), (), tilt.log, precision, linear, tilt.mean, tilt.cov, tilt.error
             )
         joint = np.broadcast_to(tilt.log + outer, (len(at), *self.cards))
@@ -210,12 +206,38 @@ class Batch:
             )
             covs = np.broadcast_to(tilt.cov, (*joint.shape, self.k, self.k))
             _, mean, cov = mixed(flat, means, covs.reshape(len(at), states, self.k, self.k))[:3]
-        return _Found(log, tables, cavities, joint, precision, linear, mean, cov, tilt.error)
+        return Found(log, tables, cavities, joint, precision, linear, mean, cov, tilt.error)
+
+    def _send_tables(
+        self, beliefs: Beliefs, at: np.ndarray, found: Found, fine: np.ndarray, step: float
+    ) -> None:
+        """Messages to finite variables, by a share of the way."""
+        for end, edge in enumerate(self.edges):
+            new = clipped(found.tables[end] - found.cavities[end])
+            new = np.where(fine[:, None], new, self.tables[end][at])
+            change = step * (new - self.tables[end][at])
+            self.tables[end][at] += change
+            logs = beliefs.finite[edge.group].logs
+            if self.count == 1 or _is_unique(edge.at[at]):
+                logs[edge.at[at]] += change
+            else:
+                np.add.at(logs, edge.at[at], change)
+
+    def _product(
+        self,
+        beliefs: Beliefs,
+        at: np.ndarray,
+        precision: np.ndarray,
+        linear: np.ndarray,
+        near: tuple[np.ndarray, np.ndarray],
+    ) -> Tilt:
+        """Factors times the cavities of what is not finite."""
+        return self.kernel.tilted(self._index(at), precision, linear, near)
 
     def _index(self, at: np.ndarray) -> np.ndarray:
         return at if self.index is None else self.index[at]
 
-    def _constants(self, found: _Found, at: np.ndarray) -> np.ndarray:
+    def _constants(self, beliefs: Beliefs, found: Found, at: np.ndarray) -> np.ndarray:
         """Logs by which factors exceed their messages, with the cavities that were found."""
         logs = found.log.copy()
         for cavity, table in zip(found.cavities, self.tables, strict=True):
@@ -265,7 +287,7 @@ class Batch:
         np.add.at(blocks.linear, (c, columns), np.matvec(turned, linear))
 
     def _moved(
-        self, beliefs: Beliefs, at: np.ndarray, found: _Found, fine: np.ndarray, share: float
+        self, beliefs: Beliefs, at: np.ndarray, found: Found, fine: np.ndarray, share: float
     ) -> int:
         """Move Gaussian messages as far as components stay proper; how many could not."""
         blocks = beliefs.blocks[self.block]
@@ -301,7 +323,7 @@ class Batch:
         return skipped
 
 
-class _Found(NamedTuple):
+class Found(NamedTuple):
     """Factors times their cavities."""
 
     log: np.ndarray
@@ -328,6 +350,11 @@ def _is_definite(matrices: np.ndarray) -> np.ndarray:
         return matrices[..., 0, 0] > 0
     _, bad = try_cholesky(np.where(np.isfinite(matrices), matrices, 0.0))
     return np.ones(len(matrices), dtype=bool) if bad is None else ~bad
+
+
+def _whole(share: float) -> float:
+    """Tables of finite variables alone are not damped, unless nothing comes closer."""
+    return 1.0 if share > 0.5 else share
 
 
 def _is_unique(places: np.ndarray) -> bool:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from bayesmc.factors.families import Family
 from bayesmc.factors.tilted import log_integral, log_sum
 from bayesmc.gaussian import try_cholesky
 
@@ -104,6 +105,18 @@ class Finite:
 
 
 @dataclass(eq=False)
+class Conjugates:
+    """Elements of one family: natural parameters, exact part and messages, shape (elements, statistics)."""
+
+    family: Family
+    naturals: np.ndarray
+
+    @property
+    def log_total(self) -> float:
+        return float(self.family.log_total(self.naturals).sum())
+
+
+@dataclass(eq=False)
 class Beliefs:
     """All of them.
 
@@ -120,6 +133,7 @@ class Beliefs:
     size: np.ndarray
     component: np.ndarray
     place: np.ndarray
+    families: list[Conjugates] = field(default_factory=list)
 
     @classmethod
     def of(cls, component: np.ndarray, cards: Sequence[int], counts: Sequence[int]) -> Beliefs:
@@ -143,7 +157,9 @@ class Beliefs:
 
     @property
     def log_total(self) -> float:
-        return sum(b.log_total for b in self.blocks) + sum(f.log_total for f in self.finite)
+        gaussian = sum(b.log_total for b in self.blocks)
+        finite = sum(f.log_total for f in self.finite)
+        return gaussian + finite + sum(c.log_total for c in self.families)
 
     def moments(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of some coordinates, in order."""

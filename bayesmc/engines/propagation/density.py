@@ -15,7 +15,6 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions import Bernoulli, Distribution
-from bayesmc.engines.propagation.beliefs import IMPOSSIBLE
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.kernels import Density, Probit, Tables
 from bayesmc.engines.propagation.scopes import basis
@@ -107,25 +106,27 @@ class Terms:
                 f"followed ({error}); use Gibbs or HamiltonianMonteCarlo"
             ) from error
 
+    def shape_of(self, name: str) -> tuple[tuple[int, ...], tuple[str, ...], tuple[str, ...]]:
+        """The shape of a term's factors, its plates and what it reads."""
+        model = self.model
+        if name in model.nodes:
+            node = model[name]
+            return node.plate_shape, node.plates, node.parents
+        potential = model.potentials[name][0]
+        return potential_shape(model.sizes, potential), potential.plates, potential.parents
+
     # ---- private -------------------------------------------------------------------------------
 
     def _read(self, name: str, elements: np.ndarray | None) -> Read:
-        model = self.model
-        if name in model.nodes:
-            plates, parents = model[name].plates, model[name].parents
-            shape: tuple[int, ...] = model[name].plate_shape
-        else:
-            potential = model.potentials[name][0]
-            plates, parents = potential.plates, potential.parents
-            shape = potential_shape(model.sizes, potential)
+        shape, plates, parents = self.shape_of(name)
         at = np.arange(math.prod(shape)) if elements is None else elements
         found = self._as_probit(name, shape, at)
         if found is not None:
             return found
-        root = self._log_factor(name, shape)
+        root = self.log_factor(name, shape)
         free = {n.leaf.name for n in self.numbers.values()} & root.leaves  # type: ignore[attr-defined]
         inner = directions(_widened(root, frozenset(free)), free)
-        scope, values, cards = self._configured(
+        scope, values, cards = self.configured(
             name, plates, parents, inner.residual, inner.combinations
         )
         for called, form in zip(inner.names, inner.combinations, strict=True):
@@ -134,10 +135,10 @@ class Terms:
         if not inner.combinations:
             (logs,) = Program([inner.residual])(values)
             wide = _spread(logs, (*cards, *shape), len(shape)).reshape(*cards, -1)[..., at]
-            kernel = Tables(np.maximum(np.moveaxis(wide, -1, 0), IMPOSSIBLE))
+            kernel = Tables(np.moveaxis(wide, -1, 0))
             none = np.zeros((len(at), 0))
             return Read(name, kernel, places, none.astype(int), none[:, None], at)
-        offset, gain, coordinates = self._coefficients(inner.combinations, values, cards, shape, at)
+        offset, gain, coordinates = self.coefficients(inner.combinations, values, cards, shape, at)
         states, d = math.prod(cards), offset.shape[-1]
         m = coordinates.shape[-1]
         weights, within = basis(gain.reshape(len(at), states * d, m))
@@ -177,13 +178,13 @@ class Terms:
             form = affine(inside, free)
         except TraceError:
             return None
-        offset, gain, coordinates = self._coefficients((form,), self.known, (), shape, at)
+        offset, gain, coordinates = self.coefficients((form,), self.known, (), shape, at)
         weights, within = basis(gain.reshape(len(at), 1, -1))
         sign = 2.0 * np.broadcast_to(self.known[name], shape).reshape(-1)[at] - 1.0
         kernel = Probit(sign, offset[:, 0, 0], within[:, 0, 0])
         return Read(name, kernel, (), coordinates, weights, at)
 
-    def _log_factor(self, name: str, shape: tuple[int, ...]) -> Expression:
+    def log_factor(self, name: str, shape: tuple[int, ...]) -> Expression:
         """The log factor of free numbers and what is known or finite."""
         model = self.model
         if name not in model.nodes:
@@ -215,7 +216,7 @@ class Terms:
             root = x.inside(root)
         return substituted(root, {n: x.value for n, x in mapped.items()})
 
-    def _configured(
+    def configured(
         self,
         name: str,
         plates: Sequence[str],
@@ -264,7 +265,7 @@ class Terms:
                 scope.append((n, np.full(max(count, 1), e)))
         return scope, values, cards
 
-    def _coefficients(
+    def coefficients(
         self,
         forms: Sequence[Affine],
         values: Mapping[str, np.ndarray],
@@ -302,7 +303,7 @@ class Terms:
         gain = np.concatenate([_filled(g, widest, 0.0) for g in gains], axis=2)
         place = np.concatenate([_filled(p, widest, -1) for p in places], axis=2)
         gain, place = (np.moveaxis(a, 1, 0)[at] for a in (gain, place))
-        coordinates = _unique_rows(place.reshape(len(at), -1))
+        coordinates = unique_rows(place.reshape(len(at), -1))
         d, m = offset.shape[-1], coordinates.shape[-1]
         if float(len(at)) * states * d * m > _ENTRIES:
             raise BudgetError("ExpectationPropagation: too many coefficients", 8 * _ENTRIES)
@@ -408,7 +409,7 @@ def _filled(array: np.ndarray, width: int, value: float) -> np.ndarray:
     )
 
 
-def _unique_rows(places: np.ndarray) -> np.ndarray:
+def unique_rows(places: np.ndarray) -> np.ndarray:
     """Different non-negative numbers of each row, filled up with its first; -1 in rows without any."""
     order = np.sort(places, axis=-1)
     first = np.ones_like(order, dtype=bool)

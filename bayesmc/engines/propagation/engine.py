@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from bayesmc.dbn import DynamicBayesNet
-from bayesmc.engines.propagation.static import MessageEngine
+from bayesmc.engines.propagation.static import MessageEngine, check_families
 from bayesmc.engines.propagation.sweeps import Settled, pass_once, settle
 from bayesmc.engines.propagation.system import System
 from bayesmc.engines.switching.propagation import SeriesPropagation
@@ -39,6 +39,10 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     mean, and dependence between finite nodes and numbers, which its answer does not hold. Messages need not
     settle: then there is a ``ConvergenceWarning`` that says by how much beliefs still change.
 
+    Gamma, Beta and Dirichlet nodes with known parameters keep their family where every density that reads
+    them is linear in its statistics (counts, labels, waiting times); other numbers between bounds are normal
+    scores, whose prior is exact, or mapped to the line.
+
     Parameters
     ----------
     sweeps : int
@@ -48,6 +52,9 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
         grows by itself where messages do not come closer; tables of finite nodes alone are not damped before.
     tolerance : float
         Change of a sweep with which messages have settled; see ``PropagatedPosterior.change``.
+    families : dict, optional
+        On nets: node -> ``"normal"``, for nodes that are to be mapped to the line instead of keeping their
+        own family (Gamma, Beta, Dirichlet).
     linearize : bool
         Over time: makes functions that are not affine linear at each mode's mean on the first pass forward.
     max_modes : int
@@ -97,6 +104,12 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     >>> smoothed.converged, smoothed.probabilities("s")[:, 1].round(2).tolist()
     (True, [0.06, 0.02, 0.07, 1.0, 0.13])
     """
+
+    families: Mapping[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_families(self)
 
     def unsupported(
         self,
@@ -156,6 +169,11 @@ class AssumedDensity(MessageEngine):
     until messages agree. What is linear-Gaussian is entered exactly, at once. Its answers are approximate,
     and ``posterior.check()`` tells by how much.
 
+    Parameters
+    ----------
+    families : dict, optional
+        As of ``ExpectationPropagation``.
+
     References
     ----------
     Maybeck (1982), Stochastic Models, Estimation and Control, vol. 2, ch. 12.7; Minka (2001), A family of
@@ -171,6 +189,11 @@ class AssumedDensity(MessageEngine):
     >>> bmc.infer(net, {"y": [1, 1, 0]}, engine=bmc.AssumedDensity()).mean("w").round(3).tolist()
     0.161
     """
+
+    families: Mapping[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        check_families(self)
 
     def passed(self, system: System, progress: bool | None) -> Settled:
         return pass_once(system)

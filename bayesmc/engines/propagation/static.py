@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +15,13 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.propagation.approximation import Messages
 from bayesmc.engines.propagation.sweeps import Settled
 from bayesmc.engines.propagation.system import System, system_of
-from bayesmc.errors import BayesmcError, ConvergenceWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import (
+    BayesmcError,
+    ConvergenceWarning,
+    UnsupportedError,
+    ZeroProbabilityError,
+    did_you_mean,
+)
 from bayesmc.network import Problem
 from bayesmc.results import Posterior
 
@@ -72,6 +79,7 @@ class MessageEngine(Engine):
     """Base of ``ExpectationPropagation`` and ``AssumedDensity`` on nets; a family supplies ``passed``."""
 
     label: ClassVar[str] = "expectation propagation"
+    families: Mapping[str, str] | None
 
     def passed(self, system: System, progress: bool | None) -> Settled:
         """Pass messages."""
@@ -83,7 +91,7 @@ class MessageEngine(Engine):
 
     def refusal(self, problem: Problem) -> str | None:
         try:
-            _system(problem, type(self).__name__)
+            _system(problem, self)
         except ZeroProbabilityError:
             return None
         except BayesmcError as error:
@@ -93,16 +101,16 @@ class MessageEngine(Engine):
         return None
 
     def describe(self, problem: Problem) -> dict[str, str]:
-        system = _system(problem, type(self).__name__)
+        system = _system(problem, self)
         return {name: _treated(problem, system, name) for name in problem.model.nodes}
 
     def effort(self, problem: Problem) -> str:
         """What ``explain`` adds: what is approximated, and that nobody knows by how much."""
-        system = _system(problem, type(self).__name__)
-        tables = sum(b.count for b in system.batches if not b.k)
+        system = _system(problem, self)
+        tables = sum(b.count for b in system.batches if b.kernel.how == "table")
         kinds = Counter[str]()
         for batch in system.batches:
-            if batch.k:
+            if batch.kernel.how != "table":
                 kinds[batch.kernel.how] += batch.count
         parts = [f"{n} by {how}" for how, n in kinds.items()]
         if tables:
@@ -133,7 +141,7 @@ class MessageEngine(Engine):
         name = type(self).__name__
         if resume is not None:
             raise UnsupportedError(f"{name}: there is nothing to go on with; give more sweeps")
-        system = _system(problem, name, again=True)
+        system = _system(problem, self, again=True)
         with marking_invalid(), np.errstate(all="ignore"):
             end = self.passed(system, progress)
         doubt = self.doubt(end)
@@ -149,18 +157,48 @@ class MessageEngine(Engine):
         return PropagatedPosterior.of(problem, self, system, end, seed)
 
 
+def check_families(engine: Any) -> None:
+    """Refuse families that there are not."""
+    name, families = type(engine).__name__, engine.families
+    if families is None:
+        return
+    if not isinstance(families, Mapping):
+        raise ValueError(f"{name}(families={families!r}): give a dict from node to family")
+    for node, family in families.items():
+        if family != "normal":
+            raise ValueError(
+                f'{name}(families={{{node!r}: {family!r}}}): there is "normal", which maps the node to the '
+                "line; its own family it keeps by itself where that can be"
+            )
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _system(problem: Problem, who: str, again: bool = False) -> System:
+def _system(problem: Problem, engine: MessageEngine, again: bool = False) -> System:
     """The system of a problem, as it was asked about before; a run takes it along."""
-    kept = problem.cache.pop("propagated", None)
-    if kept is None:
+    mapped = frozenset(engine.families or ())
+    who = type(engine).__name__
+    kept: dict[Any, System] = problem.cache.setdefault("systems of messages", {})
+    found = kept.pop(mapped, None)
+    if found is None:
+        for name in sorted(mapped):
+            node = problem.model.nodes.get(name)
+            if (
+                node is None
+                or not node.is_stochastic
+                or node.domain is not None
+                or node.is_discrete
+            ):
+                hint = did_you_mean(name, problem.model.nodes)
+                raise UnsupportedError(
+                    f"{who}: families= names {name!r}, which is no continuous node{hint}"
+                )
         with marking_invalid(), np.errstate(all="ignore"):
-            kept = system_of(problem, who)
+            found = system_of(problem, who, mapped)
     if not again:
-        problem.cache["propagated"] = kept
-    return kept
+        kept[mapped] = found
+    return found
 
 
 def _treated(problem: Problem, system: System, name: str) -> str:
@@ -179,6 +217,9 @@ def _treated(problem: Problem, system: System, name: str) -> str:
         if x.is_score:
             kind, prior = "jointly Gaussian in normal scores", "prior exact"
         return f"{kind}; {prior}"
+    if name in system.kept:
+        family = system.beliefs.families[system.kept[name].field].family
+        return f"{family.words}; prior exact"
     if name in system.target.chain:
         return f"probabilities of its states; {own or 'no factor of its own'}"
     if node.kind == "deterministic":

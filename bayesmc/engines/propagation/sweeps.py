@@ -121,6 +121,9 @@ def _marginals(beliefs: Beliefs) -> list[tuple[np.ndarray, ...]]:
     found: list[tuple[np.ndarray, ...]] = [
         (b.mean.copy(), b.cov.diagonal(0, -2, -1).copy()) for b in beliefs.blocks
     ]
+    found += [
+        (c.naturals.copy(), c.family.expected(c.naturals), c.naturals) for c in beliefs.families
+    ]
     return found + [(f.probabilities,) for f in beliefs.finite]
 
 
@@ -134,6 +137,8 @@ def _distance(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray
             ratio = one[1] / two[1]
             square = (one[0] - two[0]) ** 2
             apart = 0.5 * (ratio + 1.0 / ratio - 2.0) + 0.5 * square * (1.0 / one[1] + 1.0 / two[1])
+        elif len(one) == 3:
+            apart = ((two[0] - one[0]) * (two[1] - one[1])).sum(axis=-1)
         else:
             p, q = (np.maximum(a[0], _TINY) for a in (one, two))
             apart = ((p - q) * np.log(p / q)).sum(axis=-1)
@@ -153,7 +158,7 @@ def _refuse_impossible(system: System, at_all: bool = False) -> None:
         if finite.logs.size and (finite.logs.max(axis=-1) < NOTHING).any():
             raise ZeroProbabilityError("ExpectationPropagation: the evidence has probability zero")
     for batch in system.batches:
-        if not batch.k and (batch.logs < NOTHING).any():
+        if (batch.logs < batch.floor).any():
             raise ZeroProbabilityError(
                 f"ExpectationPropagation: the evidence has probability zero at node {batch.name!r}"
             )

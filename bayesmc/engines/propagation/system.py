@@ -6,16 +6,17 @@ factors of finite nodes alone are tables; all others are approximated.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from bayesmc.distributions import MvNormal, Normal
 from bayesmc.engines.propagation.assembly import Assembly, System, Table
-from bayesmc.engines.propagation.coordinates import Numbers, numbers_of
+from bayesmc.engines.propagation.coordinates import numbers_of
 from bayesmc.engines.propagation.density import Read, Terms
 from bayesmc.engines.propagation.linear import linear_rows, score_rows
 from bayesmc.engines.propagation.scopes import Rows
+from bayesmc.engines.propagation.statistics import OwnFamilies
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import Family
 from bayesmc.factors import FactorLike, LogTable
@@ -25,7 +26,9 @@ from bayesmc.structure import Variable, constants_of, discrete_net, known_values
 from bayesmc.structure.target import Target, target_of
 
 
-def system_of(problem: Problem, who: str = "ExpectationPropagation") -> System:
+def system_of(
+    problem: Problem, who: str = "ExpectationPropagation", mapped: Collection[str] = ()
+) -> System:
     """The system of a posed problem.
 
     Raises
@@ -38,7 +41,7 @@ def system_of(problem: Problem, who: str = "ExpectationPropagation") -> System:
         plain = target_of(problem)
         chosen = _chosen(problem, plain, left_out, who)
         try:
-            return _assembled(problem, target_of(problem, chosen), who)
+            return _assembled(problem, target_of(problem, chosen), who, mapped)
         except _Barren as found:
             left_out.add(found.name)
 
@@ -91,14 +94,17 @@ def _chosen(problem: Problem, plain: Target, left_out: set[str], who: str) -> li
     return found
 
 
-def _assembled(problem: Problem, target: Target, who: str) -> System:
+def _assembled(problem: Problem, target: Target, who: str, mapped: Collection[str]) -> System:
     model, observed = problem.model, problem.observed
     barren = set(target.chain) - set(target_of(problem).chain)
     known = {**known_values(model, constants_of(model, problem.inputs), observed)}
     known.update({n: o.value for n, o in observed.items() if o.mask is None})
     chain = [model[n] for n in target.chain]
-    numbers = numbers_of(model, [n for n in chain if n.domain is None], observed)
-    finite = _finite(model, target, known, numbers)
+    hidden = {n.name for n in chain if n.domain is None}
+    finite = _finite(model, target, hidden)
+    own = OwnFamilies(model, target, known, finite, observed, mapped)
+    free = [n for n in chain if n.name in hidden and n.name not in own.nodes]
+    numbers = numbers_of(model, free, observed)
     states = {
         (n, int(e)): int(o.value.flat[e])
         for n, o in observed.items()
@@ -109,12 +115,10 @@ def _assembled(problem: Problem, target: Target, who: str) -> System:
     terms = Terms(model, known, numbers, finite)
     tabled: set[str] = set()
     for name in target.terms:
-        above = _numbers_above(model, name, numbers)
-        if (
-            not above
-            and name not in numbers
-            and (name not in model.nodes or _is_tabled(target, name))
-        ):
+        if name in own.nodes or name in own.factors:
+            continue
+        above = _numbers_above(model, name, hidden)
+        if not above and name not in hidden and _is_tabled(target, name):
             tabled.add(name)
             continue
         if name in numbers and numbers[name].is_score:
@@ -136,31 +140,31 @@ def _assembled(problem: Problem, target: Target, who: str) -> System:
             elements = np.flatnonzero(seen.mask)
         parts.append(terms.read(name, elements))
     tables = _tables(problem, target, tabled, finite, states, who)
-    return Assembly(problem, target, numbers, parts, tables, states).system()
+    return Assembly(problem, target, numbers, parts, tables, states, own).system()
 
 
 def _is_tabled(target: Target, name: str) -> bool:
+    if name not in target.model.nodes:
+        return True
     seen = target.seen(name)
     return target.model[name].domain is not None or seen is None or seen.mask is None
 
 
-def _finite(
-    model: Model, target: Target, known: Mapping[str, np.ndarray], numbers: Mapping[str, Numbers]
-) -> frozenset[str]:
+def _finite(model: Model, target: Target, hidden: Collection[str]) -> frozenset[str]:
     """Finite nodes that are variables: hidden ones, and those computed of finite ones alone."""
     found = {n for n in target.chain if model[n].domain is not None}
     for name, node in model.nodes.items():
         if node.kind == "deterministic" and node.domain is not None:
             above = model.above(node.parents, lambda n: not model[n].is_stochastic)
-            if not any(p in numbers for p in above):
+            if not any(p in hidden for p in above):
                 found.add(name)
     return frozenset(found)
 
 
-def _numbers_above(model: Model, name: str, numbers: Mapping[str, Numbers]) -> list[str]:
+def _numbers_above(model: Model, name: str, hidden: Collection[str]) -> list[str]:
     """Hidden continuous nodes that a function reads, through computed ones."""
     reached = model.above(model.parents(name), lambda n: not model[n].is_stochastic)
-    return [n for n in reached if n in numbers]
+    return [n for n in reached if n in hidden]
 
 
 def _computed_of(model: Model, name: str, finite: frozenset[str]) -> list[str]:
