@@ -16,6 +16,7 @@ import numpy as np
 from bayesmc.errors import TraceError
 from bayesmc.expression import Elementwise, Expression, elementwise, leaf, ordered, replaced
 from bayesmc.passes.affine import Affine, affine
+from bayesmc.passes.arithmetic import rewritten
 from bayesmc.passes.reads import sunk
 
 #: functions that jump or bend where their operands meet
@@ -64,6 +65,7 @@ def directions(root: Expression, names: Collection[str]) -> Directions:
     (<Elementwise tanh ()>, array([ 2., -1.]))
     """
     wanted = frozenset(names)
+    (root,) = rewritten([root], lambda node, new: _differences(node, new, wanted))
     for name in sorted(wanted & root.leaves):
         root = sunk(root, name)
     forms: dict[Expression, Affine | None] = {}
@@ -145,6 +147,17 @@ def breaks(root: Expression, names: Collection[str]) -> list[Expression]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _differences(
+    node: Expression, new: Sequence[Expression], wanted: frozenset[str]
+) -> Expression | None:
+    """Two numbers compared as their difference with zero, which is one number."""
+    if not isinstance(node, Elementwise) or node.function not in _COMPARED:
+        return None
+    if not all(a.leaves & wanted for a in new):
+        return None
+    return elementwise(node.function, elementwise(np.subtract, *new), 0.0)
 
 
 def _straightened(margin: Expression, wanted: frozenset[str]) -> Iterator[Expression]:

@@ -205,6 +205,17 @@ def test_loops_are_said_to_be_loopy(capsys: pytest.CaptureFixture[str]) -> None:
     assert "on trees, exact" in capsys.readouterr().out
 
 
+def test_numbers_that_are_compared_are_one_direction() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("b", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda a, b: bmc.Bernoulli(a > b))
+    posterior = bmc.infer(net, {"y": 1}, engine=EP())
+    assert posterior.mean("a") == pytest.approx(1 / np.sqrt(np.pi), abs=1e-6)
+    assert posterior.cov("a", "b")[0, 1] == pytest.approx(1 / np.pi, abs=1e-6)
+    assert posterior.log_marginal_likelihood == pytest.approx(-np.log(2.0), abs=1e-6)
+
+
 def test_contradictions_are_refused() -> None:
     net = bmc.BayesNet()
     net.table("a", [], [0.5, 0.5])

@@ -280,64 +280,69 @@ def _in_logs(root: Expression, name: str, statistics: Mapping[str, Statistic]) -
     if not {f"log1m {name}", f"x {name}"} & set(statistics):  # shares as a vector
         (root,) = rewritten([root], lambda node, new: _whole(node, new, name))
     root = sunk(root, name)
-    chosen = set(reads(root, name))
-    (own,) = (n for n in ordered(root) if isinstance(n, Leaf) and n.name == name)
-
-    def stands(what: str, choice: Expression) -> Expression | None:
-        found = statistics.get(f"{what} {name}")
-        return None if found is None else replaced(choice, {own: found.leaf})
-
-    def negated(node: Expression) -> Expression | None:
-        """The choice whose negative, or difference from one, a node is."""
-        if isinstance(node, Elementwise) and node.function is np.negative:
-            return node.operands[0] if node.operands[0] in chosen else None
-        return None
-
-    def complement(node: Expression) -> Expression | None:
-        if isinstance(node, Elementwise) and node.function is np.subtract:
-            one, other = node.operands
-            if isinstance(one, Constant) and (one.value == 1.0).all() and other in chosen:
-                return other
-        return None
-
-    def logged(node: Expression) -> Expression | None:
-        """The logarithm of a choice, its complement, of products and quotients, in statistics."""
-        if node in chosen:
-            return stands("log", node)
-        if name not in node.leaves:
-            return elementwise(np.log, node)
-        other = complement(node)
-        if other is not None:
-            return stands("log1m", other)
-        if isinstance(node, Elementwise) and node.function in (np.multiply, np.divide):
-            one, two = map(logged, node.operands)
-            if one is not None and two is not None:
-                return elementwise(
-                    np.add if node.function is np.multiply else np.subtract, one, two
-                )
-        return None
-
-    def change(node: Expression, new: list[Expression]) -> Expression | None:
-        if not isinstance(node, Elementwise):
-            return None
-        function, inner = node.function, node.operands
-        made: Expression | None = None
-        if function is np.log and name in inner[0].leaves:
-            made = logged(inner[0])
-        elif function is np.log1p and negated(inner[0]) is not None:
-            made = stands("log1m", negated(inner[0]))  # type: ignore[arg-type]
-        elif function is special.xlogy and name in inner[1].leaves and name not in inner[0].leaves:
-            log = logged(inner[1])
-            made = None if log is None else elementwise(np.multiply, new[0], log)
-        elif function is special.xlog1py and negated(inner[1]) is not None:
-            log = stands("log1m", negated(inner[1]))  # type: ignore[arg-type]
-            made = None if log is None else elementwise(np.multiply, new[0], log)
-        return made
-
-    (found,) = rewritten([root], change)
+    logs = _Logs(root, name, statistics)
+    (found,) = rewritten([root], logs.change)
     plain = statistics.get(f"x {name}")
     if name in found.leaves and plain is not None:
-        found = replaced(found, {own: plain.leaf})
+        found = replaced(found, {logs.own: plain.leaf})
     if name in found.leaves:
         raise TraceError(f"it is not linear in logarithms of {name!r}")
     return found
+
+
+class _Logs:
+    """Logarithms of a leaf's elements, and of one minus these, as leaves of their own."""
+
+    def __init__(self, root: Expression, name: str, statistics: Mapping[str, Statistic]) -> None:
+        self.name, self.statistics = name, statistics
+        self.chosen = set(reads(root, name))
+        (self.own,) = (n for n in ordered(root) if isinstance(n, Leaf) and n.name == name)
+
+    def change(self, node: Expression, new: Sequence[Expression]) -> Expression | None:
+        """What stands for a function of the leaf; None where it is kept."""
+        if not isinstance(node, Elementwise):
+            return None
+        function, inner = node.function, node.operands
+        if function is np.log and self.name in inner[0].leaves:
+            return self._logged(inner[0])
+        if function is np.log1p:
+            return self._complement(self._negated(inner[0]))
+        if function is special.xlogy and self.name not in inner[0].leaves:
+            log = self._logged(inner[1]) if self.name in inner[1].leaves else None
+        elif function is special.xlog1py:
+            log = self._complement(self._negated(inner[1]))
+        else:
+            return None
+        return None if log is None else elementwise(np.multiply, new[0], log)
+
+    def _stands(self, what: str, choice: Expression) -> Expression | None:
+        found = self.statistics.get(f"{what} {self.name}")
+        return None if found is None else replaced(choice, {self.own: found.leaf})
+
+    def _complement(self, choice: Expression | None) -> Expression | None:
+        return None if choice is None else self._stands("log1m", choice)
+
+    def _negated(self, node: Expression) -> Expression | None:
+        """The choice whose negative a node is."""
+        if isinstance(node, Elementwise) and node.function is np.negative:
+            return node.operands[0] if node.operands[0] in self.chosen else None
+        return None
+
+    def _logged(self, node: Expression) -> Expression | None:
+        """The logarithm of a choice, of one minus it, of products and quotients."""
+        if node in self.chosen:
+            return self._stands("log", node)
+        if self.name not in node.leaves:
+            return elementwise(np.log, node)
+        if not isinstance(node, Elementwise):
+            return None
+        if node.function is np.subtract:
+            one, other = node.operands
+            is_one = isinstance(one, Constant) and bool((one.value == 1.0).all())
+            return self._complement(other) if is_one and other in self.chosen else None
+        if node.function in (np.multiply, np.divide):
+            parts = [self._logged(a) for a in node.operands]
+            if parts[0] is not None and parts[1] is not None:
+                added = np.add if node.function is np.multiply else np.subtract
+                return elementwise(added, *parts)
+        return None
