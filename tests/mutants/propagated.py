@@ -57,6 +57,14 @@ def halved() -> bmc.BayesNet:
     return net
 
 
+def shared() -> bmc.BayesNet:
+    """Three throws of a coin of unknown bias."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("p", bmc.Beta(1.0, 1.0))
+    net.add("k", lambda p: bmc.Bernoulli(p), plates="i")
+    return net
+
+
 def told(
     make: Callable[[], bmc.BayesNet],
     evidence: dict[str, Any],
@@ -154,9 +162,14 @@ MUTANTS = [
     ),
     Mutant(
         "quadrature does not know where a factor jumps",
-        (Edit(f"{AT}kernels:Density.tilted",
-              "self._breaks(members, self.offset[members], self.gain[members])", "None"),),
+        (Edit(f"{AT}kernels:Density._integrated", "breaks)", "None)"),),
         TRUNCATED,
+        BY,
+    ),
+    Mutant(
+        "a family of its own is matched without dividing the message out",
+        (Edit(f"{AT}conjugate:ConjugateBatch._faced", " - self.sites[at]", ""),),
+        told(shared, {"k": np.array([1, 0, 1])}, {"mean p": np.array(0.6), "log": np.log(1.0 / 12.0)}),
         BY,
     ),
 ]  # fmt: skip

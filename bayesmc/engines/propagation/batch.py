@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs, Blocks, clipped, normalised
-from bayesmc.factors.tilted import Tilt, log_integral, log_sum, mixed
+from bayesmc.factors.tilted import Tilt, inverses, log_integral, log_sum, mixed
 from bayesmc.gaussian import try_cholesky
 
 #: a cavity or message this small, beside what it is a difference of, is rounding
@@ -144,7 +144,7 @@ class Batch:
 
     def begin(self, beliefs: Beliefs, mean: np.ndarray, cov: np.ndarray) -> None:
         """Start with Gaussian messages of these moments, shapes (count, k) and (count, k, k)."""
-        own = np.linalg.inv(cov)
+        own = inverses(cov)
         self._add(beliefs.blocks[self.block], self.everyone, own, np.matvec(own, mean))
         self.precision, self.linear = own, np.matvec(own, mean)
 
@@ -173,7 +173,7 @@ class Batch:
             outer = outer + cavity.reshape(shape)
         if self.k:
             near = self._projected(beliefs.blocks[self.block], at)
-            own = _inverse(near[1])
+            own = inverses(near[1])
             precision = own - self.precision[at]
             linear = np.matvec(own, near[0]) - self.linear[at]
             size = np.abs(own).max(axis=(-2, -1), keepdims=True) if self.k > 1 else own
@@ -297,7 +297,11 @@ class Batch:
             if proper.all()
             else np.where(proper[:, None, None], found.cov, np.eye(self.k))
         )
-        own = _inverse(cov)
+        own = inverses(cov)
+        told = np.isfinite(own).all(axis=(-2, -1))
+        if not told.all():
+            proper &= told
+            own = np.where(told[:, None, None], own, np.eye(self.k))
         new = own - found.precision
         change = np.where(proper[:, None, None], share * (new - self.precision[at]), 0.0)
         towards = np.matvec(own, found.mean) - found.linear
@@ -335,13 +339,6 @@ class Found(NamedTuple):
     mean: np.ndarray
     cov: np.ndarray
     error: float
-
-
-def _inverse(matrices: np.ndarray) -> np.ndarray:
-    """Of matrices of which most are one number."""
-    if matrices.shape[-1] == 1:
-        return 1.0 / matrices
-    return np.linalg.inv(matrices)
 
 
 def _is_definite(matrices: np.ndarray) -> np.ndarray:

@@ -14,15 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bayesmc.expression import Program
-from bayesmc.factors.tilted import (
-    Tilt,
-    along_line,
-    gaussians,
-    importance,
-    log_integral,
-    on_lattice,
-    probit,
-)
+from bayesmc.factors.quadrature import along_line, importance, on_lattice
+from bayesmc.factors.tilted import Tilt, gaussians, inverses, log_integral, probit
 
 #: numbers that a density is evaluated for at a time
 _AT_ONCE = 1 << 21
@@ -132,16 +125,16 @@ class Density:
     how: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
-        k = self.gain.shape[-1]
-        how = "quadrature along its own direction" if k == 1 or self._has_own_lines else (
-            f"quadrature in {k} dimensions" if k <= 3 else f"importance sampling in {k} dimensions"
-        )  # fmt: skip
+        d = min(self.gain.shape[-2:])
+        how = "quadrature along its own direction" if d == 1 else f"quadrature in {d} dimensions"
+        if d > 3:
+            how = f"importance sampling in {d} dimensions"
         object.__setattr__(self, "how", how)
 
     @property
-    def _has_own_lines(self) -> bool:
-        """Whether every state reads one number only, and different states different ones."""
-        return self.gain.shape[-1] > 1 and self.gain.shape[-2] == 1
+    def _has_few(self) -> bool:
+        """Whether every state reads fewer numbers than all states together."""
+        return self.gain.shape[-2] < self.gain.shape[-1]
 
     def log_factor(self, members: np.ndarray, u: np.ndarray) -> np.ndarray:
         """At directions, shape (points, f, states, d), of some factors: shape (points, f, states)."""
@@ -154,30 +147,17 @@ class Density:
         linear: np.ndarray,
         near: tuple[np.ndarray, np.ndarray],
     ) -> Tilt:
-        states, k = self.offset.shape[1], self.gain.shape[-1]
+        k = self.gain.shape[-1]
         shape = (len(members), *self.cards)
-        if self._has_own_lines:
-            found = self._by_lines(members, precision, linear, near)
+        if self._has_few:
+            found = self._by_states(members, precision, linear)
         else:
-            lead = len(members), states
+            lead = len(members), self.offset.shape[1]
             wide = np.broadcast_to(precision[:, None], (*lead, k, k))
             h = np.broadcast_to(linear[:, None], (*lead, k))
             mean = np.broadcast_to(near[0][:, None], (*lead, k))
             cov = np.broadcast_to(near[1][:, None], (*lead, k, k))
-
-            def log_factor(u: np.ndarray) -> np.ndarray:
-                own = self.offset[members] + np.matvec(self.gain[members], u)
-                return self.log_factor(members, own)
-
-            if k == 1:
-                found = along_line(
-                    log_factor, wide[..., 0, 0], h[..., 0], (mean[..., 0], np.sqrt(cov[..., 0, 0])),
-                    self._breaks(members, self.offset[members], self.gain[members]),
-                )  # fmt: skip
-            elif k <= 3:
-                found = on_lattice(log_factor, wide, h, (mean, cov))
-            else:
-                found = importance(log_factor, wide, h, (mean, cov))
+            found = self._integrated(members, self.gain[members], wide, h, (mean, cov))
         return Tilt(
             found.log.reshape(shape), found.mean.reshape(*shape, k),
             found.cov.reshape(*shape, k, k), found.error,
@@ -185,41 +165,49 @@ class Density:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _by_lines(
+    def _integrated(
         self,
         members: np.ndarray,
+        gain: np.ndarray,
         precision: np.ndarray,
         linear: np.ndarray,
         near: tuple[np.ndarray, np.ndarray],
     ) -> Tilt:
-        """Every state along a line of its own; other directions follow as they do in the cavity."""
-        cov = np.linalg.inv(precision)
-        whole = log_integral(precision, linear)
-        mean = np.matvec(cov, linear)
-        gain = self.gain[members][..., 0, :]
-        turned = np.matvec(cov[:, None], gain)
-        var = np.vecdot(gain, turned)
-        flat = var <= 0
-        var = np.where(flat, 1.0, var)
-        middle = np.vecdot(gain, mean[:, None])
-        at = np.where(flat, 0.0, middle)
-        ones = np.ones((*gain.shape[:-1], 1, 1))
+        """Over numbers of every state, shapes (f, states, ...), that directions are made of by ``gain``."""
 
         def log_factor(u: np.ndarray) -> np.ndarray:
-            own = self.offset[members] + np.where(flat[..., None], 0.0, u)
-            return self.log_factor(members, own)
+            return self.log_factor(members, self.offset[members] + np.matvec(gain, u))
 
-        breaks = self._breaks(members, self.offset[members], ones)
-        found = along_line(log_factor, 1.0 / var, at / var, (at, np.sqrt(var)), breaks)
-        log = found.log - log_integral((1.0 / var)[..., None, None], (at / var)[..., None])
-        log = log + whole[:, None]
-        pull = np.where(flat, 0.0, (found.mean[..., 0] - at) / var)
-        shrink = np.where(flat, 0.0, (var - found.cov[..., 0, 0]) / var**2)
-        outer = turned[..., :, None] * turned[..., None, :]
-        return Tilt(
-            log, mean[:, None] + pull[..., None] * turned,
-            cov[:, None] - shrink[..., None, None] * outer, found.error,
-        )  # fmt: skip
+        k = gain.shape[-1]
+        if k == 1:
+            spread = np.sqrt(near[1][..., 0, 0])
+            breaks = self._breaks(members, self.offset[members], gain)
+            line = precision[..., 0, 0], linear[..., 0]
+            return along_line(log_factor, *line, (near[0][..., 0], spread), breaks)
+        rule = on_lattice if k <= 3 else importance
+        return rule(log_factor, precision, linear, near)
+
+    def _by_states(self, members: np.ndarray, precision: np.ndarray, linear: np.ndarray) -> Tilt:
+        """Every state over the numbers that it reads; others follow as they do in the cavity."""
+        gain = self.gain[members]
+        cov = inverses(precision)
+        mean = np.matvec(cov, linear)
+        turned = cov[:, None] @ np.matrix_transpose(gain)
+        spread, middle = gain @ turned, np.matvec(gain, mean[:, None])
+        idle = (spread.diagonal(0, -2, -1) <= 0).all(axis=-1)  # a state that reads nothing
+        d = gain.shape[-2]
+        spread = np.where(idle[..., None, None], np.eye(d), spread)
+        middle = np.where(idle[..., None], 0.0, middle)
+        own = inverses(spread)
+        h = np.matvec(own, middle)
+        plain = np.where(idle[..., None, None], 0.0, np.eye(d))
+        found = self._integrated(members, plain, own, h, (middle, spread))
+        log = found.log - log_integral(own, h) + log_integral(precision, linear)[:, None]
+        pull = turned @ own
+        pull = np.where(idle[..., None, None], 0.0, pull)
+        shrink = pull @ (spread - found.cov) @ np.matrix_transpose(pull)
+        moved = np.matvec(pull, found.mean - middle)
+        return Tilt(log, mean[:, None] + moved, cov[:, None] - shrink, found.error)
 
     def _breaks(
         self, members: np.ndarray, offset: np.ndarray, gain: np.ndarray
