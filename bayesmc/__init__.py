@@ -47,6 +47,8 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
+from bayesmc.engines.approximate.laplace import LaplaceApproximation
+from bayesmc.engines.approximate.posterior_mode import PosteriorMode, map
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
@@ -117,6 +119,7 @@ __all__ = [
     "KalmanFilter",
     "KernelDensity",
     "Laplace",
+    "LaplaceApproximation",
     "LikelihoodWeighting",
     "LogNormal",
     "Marginal",
@@ -133,6 +136,7 @@ __all__ = [
     "PlateArray",
     "Poisson",
     "Posterior",
+    "PosteriorMode",
     "RandomWalk",
     "Recovery",
     "Rejection",
@@ -154,6 +158,7 @@ __all__ = [
     "infer",
     "io",
     "log_density",
+    "map",
     "markov",
     "montecarlo",
     "most_likely",

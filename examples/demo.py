@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from examples import (
     banana,
     bimodal_mixture,
+    bioassay,
     ceiling_robot,
     central_limit,
     clutter,
@@ -49,8 +50,8 @@ FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
-    clutter, trueskill, probit_regression,
-    banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
+    banana, bioassay, clutter, trueskill, probit_regression, corridor_doors, ceiling_robot,
+    laser_localization, sonar_localization, kidnapped_robot,
     landmark_localization, range_only, coupled_chains, switching_target,
 )  # fmt: skip
 

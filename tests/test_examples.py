@@ -16,6 +16,7 @@ from bayesmc import testing
 from bayesmc.markov import MarkovChain
 from examples import (
     bimodal_mixture,
+    bioassay,
     central_limit,
     compare,
     data_faithful,
@@ -480,3 +481,18 @@ def _mixture_by_hand(rng: np.random.Generator, joined: bool) -> dict[str, np.nda
         found.append(np.array(row)[:, np.argsort(mean[:, 1])])
     names = ("share", "mean wait", "sd of waits", "mean length", "correlation")
     return dict(zip(names, np.moveaxis(np.array(found[200:]), 1, 0), strict=True))
+
+
+def test_bioassay_is_that_of_the_book() -> None:
+    """Mode and standard deviations of Gelman et al. (2013), sec. 4.1; the mean, which a grid has."""
+    found = bioassay.ask("flat", 301, 500)
+    np.testing.assert_allclose(found.laplace.mean("line"), [0.8, 7.7], atol=0.06)
+    np.testing.assert_allclose(found.laplace.std("line"), [1.0, 4.9], atol=0.06)
+    means, sds = found.exact.moments()
+    assert (abs(found.laplace.mean("line") - means) > 0.4 * sds).all()
+    check = found.check
+    assert check.ok
+    away = abs(check.posterior.mean("line") - means)
+    assert (away < 4 * check.posterior.mcse("line")).all()
+    error = check.log_marginal_likelihood - found.exact.log_evidence
+    assert abs(error) < 4 * check.log_marginal_likelihood_mcse + 1e-3

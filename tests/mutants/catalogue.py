@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.mutants import (
+    approximate,
     chains,
     densities,
     draws,
@@ -17,6 +18,7 @@ from tests.mutants import (
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
+    *approximate.MUTANTS,
     *chains.MUTANTS,
     *draws.MUTANTS,
     *exact.MUTANTS,

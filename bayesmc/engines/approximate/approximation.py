@@ -57,10 +57,18 @@ class Approximation(Protocol):
         depends (``Target.chain``), finite ones among them. All others are drawn from the net given these.
     coordinates : str
         In which coordinates the approximation was made, in words, for ``explain`` and ``check``.
+
+    Notes
+    -----
+    It may have a method ``spread(rng, draws) -> Drawn`` besides: draws about the same centre with heavier
+    tails, with the log density of what they are drawn from. ``check`` corrects by these, since weights of a
+    density with light tails do not show what lies beyond them; without, by the approximation's own draws.
     """
 
-    names: tuple[str, ...]
-    coordinates: str
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def coordinates(self) -> str: ...
 
     def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
         """Independent joint draws of all nodes in ``names``."""

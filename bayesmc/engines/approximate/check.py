@@ -3,6 +3,8 @@
 Draws of the approximation q are weighed by p/q, with p the model's own functions (not what an engine read of
 them, so that faults of reading show, too). The largest weights are replaced by quantiles of a generalised
 Pareto distribution that is fitted to them, whose shape k says whether averages of the weights can be trusted.
+Corrected answers come from draws with heavier tails, where the approximation has some: what lies beyond the
+tails of q none of its own draws has met, and their weights cannot tell.
 
 References
 ----------
@@ -15,22 +17,21 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from bayesmc.categorical import log_sum_exp
 from bayesmc.diagnostics import MAX_PARETO_K, pareto_k
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.approximate.approximation import Approximation, Drawn
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.stored import as_stored, completed
 from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Problem
-from bayesmc.results import DrawsPosterior
+from bayesmc.results import DrawsPosterior, Posterior
 from bayesmc.structure.target import target_of
-
-if TYPE_CHECKING:
-    from bayesmc.engines.approximate.posterior import ApproximatePosterior
 
 #: draws of which a tail can be told at all
 _FEWEST = 25
@@ -58,8 +59,9 @@ class Check:
     Attributes
     ----------
     k : float
-        Shape of the tail of the weights p/q: below 0.5 good, above ``bound`` not to be trusted. Minus
-        infinity where all weights are equal: the approximation is exact.
+        Shape of the tail of the weights p/q, or of those of draws with heavier tails (whichever is larger):
+        below 0.5 good, above ``bound`` not to be trusted. Minus infinity where all weights are equal: the
+        approximation is exact.
     bound : float
         The largest k at which as many draws can be trusted, 0.7 of some 2,200 draws or more.
     ok : bool
@@ -68,15 +70,16 @@ class Check:
         Corrected answers: the draws with smoothed weights, and Monte Carlo errors that count these.
     log_marginal_likelihood, log_marginal_likelihood_mcse : float
         The corrected log evidence, and its error.
-    approximate : Posterior
-        The posterior that was checked.
+    approximate, approximation : Posterior, Approximation
+        What was checked.
     draws : int
     """
 
     k: float
     bound: float
     posterior: CheckedPosterior
-    approximate: Any = field(repr=False)
+    approximate: Posterior = field(repr=False)
+    approximation: Approximation = field(repr=False)
     draws: int
 
     @property
@@ -94,18 +97,20 @@ class Check:
         return self.posterior.log_marginal_likelihood_mcse
 
     def __str__(self) -> str:
-        verdict = (
-            "good: plain answers are near, corrected ones right within their errors"
-            if self.k < min(0.5, self.bound)
-            else "usable: take the corrected answers"
-            if self.ok
-            else "not to be trusted, corrected or not: ask HamiltonianMonteCarlo() or Gibbs()"
+        own, ess = self.posterior.k, self.posterior.weight_ess
+        plain_words = (
+            "near" if self.k < min(0.5, self.bound) else "off" if self.ok else "not to be trusted"
         )
-        ess = self.posterior.weight_ess
+        words = "right within their errors"
+        if not own < self.bound:
+            words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
+        elif not self.ok:
+            words += ", if nothing lies where no draw went"
         lines = [
-            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, "
-            f"weighed in the nodes' own coordinates (made in {self.approximate.approximation.coordinates})",
-            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}), {ess:.0f} draws' worth: {verdict}",
+            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
+            f"own coordinates (made in {self.approximation.coordinates})",
+            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {plain_words}",
+            f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
         ]
         plain = self.approximate.log_marginal_likelihood
         if plain is not None:
@@ -115,6 +120,13 @@ class Check:
             )
         return "\n".join([*lines, *self._moved()])
 
+    @cached_property
+    def _unweighted(self) -> DrawsPosterior:
+        own = self.posterior
+        return DrawsPosterior(
+            own._live("check"), own.engine, own._stored, own._shape, independent=True
+        )
+
     def _moved(self) -> list[str]:
         """The scalars whose means moved most, in standard deviations."""
         rows = []
@@ -122,8 +134,11 @@ class Check:
             node = self.posterior.model[name]
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
                 continue
-            plain, found = (p.mean(name).ravel() for p in (self.approximate, self.posterior))
-            before, after = (p.std(name).ravel() for p in (self.approximate, self.posterior))
+            # of what draws answer the same draws without weights: what moves is no chance
+            closed = self.approximation.marginal(name) is not None
+            before_weights = self.approximate if closed else self._unweighted
+            plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
+            before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
             error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
             with np.errstate(all="ignore"):
                 moved = np.where(after > 0, (found - plain) / after, 0.0)
@@ -146,48 +161,24 @@ class Check:
         return lines
 
 
-def checked(posterior: ApproximatePosterior, draws: int, rng: np.random.Generator) -> Check:
+def checked(
+    posterior: Posterior, approximation: Approximation, draws: int, rng: np.random.Generator
+) -> Check:
     """See ``ApproximatePosterior.check``."""
     if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < _FEWEST:
         raise ValueError(
             f"check(draws={draws!r}): draws is a whole number, {_FEWEST} or more, such as 4000"
         )
-    problem = posterior._live("check")
-    drawn = posterior.approximation.draw(rng, int(draws))
-    values = completed(problem, posterior.approximation.names, drawn, rng)
-    log_target = log_joint(problem, posterior.approximation.names, values, int(draws))
-    with np.errstate(invalid="ignore"):
-        raw = log_target - drawn.log_density
-    raw = np.where(np.isnan(raw), -np.inf, raw)
-    if not (raw > -np.inf).any():
-        raise ZeroProbabilityError(
-            f"check: the model gives none of {draws} draws of the approximation a positive density; ask a "
-            "sampling engine"
-        )
-    smoothed, k = pareto_smoothed(raw)
-    found = CheckedPosterior(
-        problem,
-        posterior.engine,
-        as_stored(problem, values),
-        (1, int(draws)),
-        smoothed[None],
-        independent=True,
-    )
-    found.k = k
-    total = float(log_sum_exp(smoothed[None]))
-    found.log_marginal_likelihood = total - float(np.log(draws))
-    ess = found.weight_ess
-    assert ess is not None
-    found.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
-    result = Check(k, _bound(int(draws)), found, posterior, int(draws))
+    own = _weighed(posterior, approximation, approximation.draw(rng, int(draws)), rng)
+    spread, found = getattr(approximation, "spread", None), own
+    if spread is not None and own.k > -np.inf:
+        found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
+    k = max(
+        own.k, found.k
+    )  # mass that the approximation's own draws never meet shows in wider ones
+    result = Check(k, _bound(int(draws)), found, posterior, approximation, int(draws))
     if not result.ok:
-        warnings.warn(
-            f"check: the weights of {draws} draws of {type(posterior.engine).__name__} have a heavy tail "
-            f"(Pareto k = {k:.2f}, above {result.bound:.2f}): neither its answers nor the corrected ones can "
-            "be trusted; ask a sampling engine (HamiltonianMonteCarlo(), Gibbs())",
-            LowEssWarning,
-            stacklevel=3,
-        )
+        warnings.warn(_doubt(result), LowEssWarning, stacklevel=3)
     return result
 
 
@@ -245,6 +236,54 @@ def pareto_smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _weighed(
+    posterior: Posterior, approximation: Approximation, drawn: Drawn, rng: np.random.Generator
+) -> CheckedPosterior:
+    """Draws with the model's density over their own as weights."""
+    problem, draws = posterior._live("check"), len(drawn.log_density)
+    values = completed(problem, approximation.names, drawn, rng)
+    log_target = log_joint(problem, approximation.names, values, draws)
+    with np.errstate(invalid="ignore"):
+        raw = log_target - drawn.log_density
+    raw = np.where(np.isnan(raw), -np.inf, raw)
+    if not (raw > -np.inf).any():
+        raise ZeroProbabilityError(
+            f"check: the model gives none of {draws} draws of the approximation a positive density; ask a "
+            "sampling engine"
+        )
+    smoothed, k = pareto_smoothed(raw)
+    stored = as_stored(problem, values)
+    found = CheckedPosterior(
+        problem, posterior.engine, stored, (1, draws), smoothed[None], independent=True
+    )
+    found.k = k
+    total = float(log_sum_exp(smoothed[None]))
+    found.log_marginal_likelihood = total - float(np.log(draws))
+    ess = found.weight_ess
+    assert ess is not None
+    found.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
+    return found
+
+
+def _doubt(check: Check) -> str:
+    words = (
+        f"check: the weights of {check.draws} draws of {type(check.approximate.engine).__name__} have a "
+        f"heavy tail (Pareto k = {check.k:.2f}, above {check.bound:.2f}): its answers cannot be trusted, "
+    )
+    own = check.posterior.k
+    if own < check.bound:
+        return (
+            words
+            + f"those corrected by draws with heavier tails (k = {own:.2f}) with care, since they rest "
+            f"on {check.posterior.weight_ess:.0f} draws' worth; better ask a sampling engine "
+            "(HamiltonianMonteCarlo(), Gibbs())"
+        )
+    return (
+        words
+        + "nor can the corrected ones; ask a sampling engine (HamiltonianMonteCarlo(), Gibbs())"
+    )
 
 
 def _bound(draws: int) -> float:

@@ -6,12 +6,19 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import ZeroProbabilityError
 from bayesmc.network.model import potential_shape
 from bayesmc.structure.target import Target, Term
 
 
 def log_constants(target: Target) -> float:
     """The log of all factors of what was observed whose values are known.
+
+    Raises
+    ------
+    ZeroProbabilityError
+        One is impossible, whatever the hidden nodes are.
 
     Examples
     --------
@@ -26,7 +33,17 @@ def log_constants(target: Target) -> float:
     >>> round(log_constants(target_of(pose(net, {"coin": 1, "count": 3}))), 4)  # log 0.25
     -1.3863
     """
-    return float(sum(np.sum(np.broadcast_to(t.log(target.known), t.shape)) for t in _left(target)))
+    total = 0.0
+    for term in _left(target):
+        with marking_invalid(), np.errstate(all="ignore"):
+            log = np.broadcast_to(term.log(target.known), term.shape)
+        if not (log > -np.inf).all():
+            what = "potential" if term.is_potential else "node"
+            raise ZeroProbabilityError(
+                f"{what} {term.name!r} has probability zero whatever hidden nodes are; check that evidence"
+            )
+        total += float(log.sum())
+    return total
 
 
 # ---- private ------------------------------------------------------------------------------------

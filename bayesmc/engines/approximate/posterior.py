@@ -178,7 +178,7 @@ class ApproximatePosterior(Posterior):
         >>> check.ok, float(check.posterior.mean("rate").round(1))  # exactly 3.5
         (True, 3.5)
         """
-        return checked(self, draws, stream(seed_sequence(rng), Purpose.CHECK))
+        return checked(self, self.approximation, draws, stream(seed_sequence(rng), Purpose.CHECK))
 
     # ---- private -------------------------------------------------------------------------------
 
