@@ -185,6 +185,10 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
         by_check(bmc.LaplaceApproximation(), 4000),
         {"discrete": 0, "plates": 0, "hybrid": 0.2, "hybrid plates": 0.1, "gaussian": 0.4},
     ),
+    "ExpectationPropagation, corrected": (
+        by_check(bmc.ExpectationPropagation(), 4000),
+        dict.fromkeys(KINDS, 0.5),
+    ),
     "no engine named": (by(None), dict.fromkeys(KINDS, 0.9)),
 }
 

@@ -51,6 +51,10 @@ APPROXIMATIONS: dict[str, tuple[Any, Allowed]] = {
         bmc.LaplaceApproximation(),
         Allowed(0.6, 0.3, 1.0, 0.5, {"hybrid": 0.2, "hybrid plates": 0.05, "gaussian": 0.4}),
     ),
+    "ExpectationPropagation": (
+        bmc.ExpectationPropagation(),
+        Allowed(0.2, 0.2, 0.4, 0.4, dict.fromkeys(KINDS, 0.6)),
+    ),
 }
 
 
