@@ -16,6 +16,8 @@ from scipy import special
 from bayesmc.distributions import Beta, Dirichlet, Distribution, Gamma
 
 _STEPS = 50
+#: share of the weight that members with heavier tails have
+_WIDER = 0.5
 
 
 class Family(ABC):
@@ -61,10 +63,12 @@ class Family(ABC):
         """Of numbers each by itself; of shares as a vector all of them, else the first."""
 
     @abstractmethod
-    def draw(
-        self, rng: np.random.Generator, natural: np.ndarray, draws: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Values (draws, elements, width) and their log densities (draws, elements)."""
+    def member(self, natural: np.ndarray) -> Distribution:
+        """All elements as a distribution: of numbers, or of vectors of shares."""
+
+    @abstractmethod
+    def widened(self, natural: np.ndarray) -> np.ndarray:
+        """Members about the same centre with heavier tails."""
 
 
 class GammaFamily(Family):
@@ -106,12 +110,11 @@ class GammaFamily(Family):
     def marginal(self, natural: np.ndarray, is_vector: bool) -> Distribution:
         return Gamma(natural[..., 0] + 1.0, -natural[..., 1])
 
-    def draw(
-        self, rng: np.random.Generator, natural: np.ndarray, draws: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        dist = Gamma(natural[..., 0] + 1.0, -natural[..., 1])
-        values = dist.sample(rng, (draws,))
-        return values[..., None], dist.log_prob(values)
+    def member(self, natural: np.ndarray) -> Distribution:
+        return Gamma(natural[..., 0] + 1.0, -natural[..., 1])
+
+    def widened(self, natural: np.ndarray) -> np.ndarray:
+        return _WIDER * (natural + np.array([1.0, 0.0])) - np.array([1.0, 0.0])
 
 
 class Shares(Family):
@@ -160,9 +163,8 @@ class Shares(Family):
             return Beta(alpha[..., 0], alpha[..., 1])
         return Beta(alpha, alpha.sum(axis=-1, keepdims=True) - alpha)
 
-    def draw(
-        self, rng: np.random.Generator, natural: np.ndarray, draws: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        dist = Dirichlet(natural + 1.0)
-        values = dist.sample(rng, (draws,))
-        return values, dist.log_prob(values)
+    def member(self, natural: np.ndarray) -> Distribution:
+        return Dirichlet(natural + 1.0)
+
+    def widened(self, natural: np.ndarray) -> np.ndarray:
+        return _WIDER * (natural + 1.0) - 1.0

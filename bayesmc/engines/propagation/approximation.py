@@ -19,6 +19,8 @@ from bayesmc.engines.propagation.system import System
 
 #: points of Gauss and Hermite for moments of mapped numbers
 _POINTS = 96
+#: degrees of freedom of heavier tails, and the share of even states there
+_DEGREES, _EVEN = 4.0, 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,40 +84,17 @@ class Messages:
 
     def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
         """Independent joint draws of all nodes in ``names``."""
-        beliefs = self._beliefs
-        free = np.zeros((draws, len(beliefs.size)))
-        log = np.zeros(draws)
-        for k, block in enumerate(beliefs.blocks):
-            mine = np.flatnonzero(beliefs.size == k)
-            root = np.linalg.cholesky(block.cov)
-            noise = rng.standard_normal((draws, *block.linear.shape))
-            value = block.mean + np.matvec(root, noise)
-            free[:, mine] = value[:, beliefs.component[mine], beliefs.place[mine]]
-            log -= 0.5 * (noise**2).sum(axis=(1, 2)) + 0.5 * np.log(2 * np.pi) * noise[0].size
-            log -= np.log(root.diagonal(0, -2, -1)).sum()
-        values = {}
-        for name in self.names:
-            x = self._numbers.get(name)
-            if x is not None:
-                values[name] = x.whole(free)
-                log -= _volume(x, free)
-                continue
-            node = self.model[name]
-            if name in self._kept:
-                held, rows = self._held(name)
-                drawn, logs = held.family.draw(rng, held.naturals[rows], draws)
-                values[name] = drawn[..., : 1 if not node.event_shape else None].reshape(
-                    draws, *node.value_shape
-                )
-                log += logs.sum(axis=-1)
-                continue
-            table = normalised(self._logs(name))
-            noise = rng.gumbel(size=(draws, *table.shape))
-            codes = (table + noise).argmax(axis=-1)
-            log += np.take_along_axis(table[None], codes[..., None], axis=-1)[..., 0].sum(axis=-1)
-            assert node.domain is not None
-            values[name] = codes.reshape(draws, *node.plate_shape).astype(node.domain.dtype)
-        return Drawn(values, log)
+        values, own, _ = self._drawn(rng, np.zeros(draws, dtype=bool))
+        return Drawn(values, own)
+
+    def spread(self, rng: np.random.Generator, draws: int) -> Drawn:
+        """Half of the draws its own, half with heavier tails: a defensive mixture (Hesterberg 1995).
+
+        Numbers that hang together are of a multivariate t, states are mixed with even ones, members of other
+        families have half the weight.
+        """
+        values, own, wide = self._drawn(rng, rng.random(draws) < 0.5)
+        return Drawn(values, np.logaddexp(own, wide) - np.log(2.0))
 
     def marginal(self, name: str) -> Marginal | None:
         """Of a node by itself; of simplexes and matrices by draws."""
@@ -163,6 +142,57 @@ class Messages:
 
     # ---- private -------------------------------------------------------------------------------
 
+    def _drawn(
+        self, rng: np.random.Generator, is_wide: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Draws, some with heavier tails; log densities of all of them without these, and with."""
+        beliefs, draws = self._beliefs, len(is_wide)
+        free = np.zeros((draws, len(beliefs.size)))
+        own, wide = np.zeros(draws), np.zeros(draws)
+        for k, block in enumerate(beliefs.blocks):
+            mine = np.flatnonzero(beliefs.size == k)
+            root = np.linalg.cholesky(block.cov)
+            noise = rng.standard_normal((draws, *block.linear.shape))
+            longer = np.sqrt(_DEGREES / rng.chisquare(_DEGREES, noise.shape[:2]))
+            noise *= np.where(is_wide[:, None], longer, 1.0)[..., None]
+            value = block.mean + np.matvec(root, noise)
+            free[:, mine] = value[:, beliefs.component[mine], beliefs.place[mine]]
+            size = np.log(root.diagonal(0, -2, -1)).sum()
+            normal, heavy = _log_densities((noise**2).sum(axis=-1), noise.shape[-1])
+            own, wide = own + normal.sum(axis=-1) - size, wide + heavy.sum(axis=-1) - size
+        values = {}
+        for name in self.names:
+            node, x = self.model[name], self._numbers.get(name)
+            if x is not None:
+                values[name], size = x.whole(free), _volume(x, free)
+                own, wide = own - size, wide - size
+            elif name in self._kept:
+                held, rows = self._held(name)
+                natural = held.naturals[rows]
+                both = [held.family.member(n) for n in (natural, held.family.widened(natural))]
+                one, two = (dist.sample(rng, (draws,)) for dist in both)
+                drawn = np.where(is_wide.reshape(-1, *(1,) * (one.ndim - 1)), two, one)
+                own, wide = (
+                    log + dist.log_prob(drawn).sum(axis=-1)
+                    for log, dist in zip((own, wide), both, strict=True)
+                )
+                if not node.event_shape and drawn.ndim == 3:  # the first of two shares
+                    drawn = drawn[..., 0]
+                values[name] = drawn.reshape(draws, *node.value_shape)
+            else:
+                assert node.domain is not None
+                table = normalised(self._logs(name))
+                even = np.logaddexp(table + np.log(1 - _EVEN), np.log(_EVEN / node.domain.size))
+                chosen = np.where(is_wide[:, None, None], even, table)
+                codes = (chosen + rng.gumbel(size=(draws, *table.shape))).argmax(axis=-1)
+                own, wide = (
+                    log
+                    + np.take_along_axis(t[None], codes[..., None], axis=-1)[..., 0].sum(axis=-1)
+                    for log, t in ((own, table), (wide, even))
+                )
+                values[name] = codes.reshape(draws, *node.plate_shape).astype(node.domain.dtype)
+        return values, own, wide
+
     def _held(self, name: str) -> tuple[Conjugates, np.ndarray]:
         kept = self._kept[name]
         return self._beliefs.families[kept.field], kept.rows
@@ -178,6 +208,16 @@ class Messages:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _log_densities(square: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of standard normal vectors of n numbers, and of standard t ones, by their squared lengths."""
+    normal = -0.5 * (square + n * np.log(2.0 * np.pi))
+    half = 0.5 * (_DEGREES + n)
+    heavy = (
+        special.gammaln(half) - special.gammaln(0.5 * _DEGREES) - half * np.log1p(square / _DEGREES)
+    )
+    return normal, heavy - 0.5 * n * np.log(_DEGREES * np.pi)
 
 
 def _volume(x: Numbers, free: np.ndarray) -> np.ndarray:
