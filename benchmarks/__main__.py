@@ -16,6 +16,7 @@ from benchmarks import (
     bench_switching,
     bench_time,
     bench_weighting,
+    prices,
 )
 from benchmarks.harness import data_folder, peer_python
 
@@ -40,6 +41,8 @@ if __name__ == "__main__":
     bench_approximate.main()
     print()
     bench_marginal.main()
+    print()
+    prices.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()

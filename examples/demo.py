@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 from examples import (
     banana,
+    bee_dance,
     bimodal_mixture,
     bioassay,
     ceiling_robot,
@@ -21,6 +22,7 @@ from examples import (
     diagnosis,
     expectation_and_marginal,
     faithful_gibbs,
+    gnp_trend_cycle,
     growth_benchmark,
     ising_denoising,
     kernels_as_chains,
@@ -34,11 +36,11 @@ from examples import (
     picture,
     probit_regression,
     pushforward,
+    radar_target,
     range_only,
     rejection_and_importance,
     sonar_localization,
     stochastic_volatility,
-    switching_target,
     three_views,
     trueskill,
     van_der_merwe,
@@ -51,8 +53,8 @@ FIGURES = (
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
     banana, bioassay, clutter, trueskill, probit_regression, corridor_doors, ceiling_robot,
-    laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, coupled_chains, switching_target,
+    laser_localization, sonar_localization, kidnapped_robot, landmark_localization, range_only,
+    coupled_chains, radar_target, bee_dance, gnp_trend_cycle,
 )  # fmt: skip
 
 

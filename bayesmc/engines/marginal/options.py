@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
+from bayesmc.engines.filtering import Asked
 from bayesmc.engines.marginal.choices import MOST
+from bayesmc.engines.marginal.smoothing import why_not_backwards
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
-#: why fixed lags are not answered
+#: why fixed lags are not answered where plates are filtered separately
 NOT_LAGGED = (
-    "ParticleFilter: lag= answers by the ancestors of later particles, and these tell nothing of what "
-    "marginalize= integrates out; smooth without lag=, or give marginalize=None"
+    "ParticleFilter: with marginalize=, lag= does not take plates whose elements are filtered separately; "
+    "smooth without lag=, or give marginalize=None"
 )
 _SEEN = "observed, weights the particles by its predictive density"
 #: options that do not go with it
@@ -129,13 +132,36 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
 
 
+def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
+    """Computed nodes that keep trajectories from being drawn backwards: none that is integrated out."""
+    split = split_of_problem(engine, problem)
+    if split is not None and why_not_backwards(problem.slices, split) is None:
+        return ()
+    return endless(problem.slices, problem.seen)
+
+
+def back(engine: Any, problem: SeriesProblem, asked: Asked) -> str:
+    """How smoothing is done, where something is integrated out."""
+    split = split_of_problem(engine, problem)
+    if split is None or asked.what not in ("smooth", "fixed-lag"):
+        return ""
+    if asked.what == "fixed-lag":
+        return "a Kalman smoother along the ancestors of each particle"
+    why = why_not_backwards(problem.slices, split)
+    if why is None:
+        return "paths of what is sampled drawn backwards, a Kalman smoother along each"
+    return f"trajectories of all nodes drawn backwards: nothing stays integrated out, as {why}"
+
+
 def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
     """What is done to each node, given what plain particles do to it."""
-    split = split_of_problem(engine, problem)
-    found = dict(treated)
-    if split is None:
+    found, slices = dict(treated), problem.slices
+    if engine.marginalize is None:
         return found
-    slices = problem.slices
+    known = frozenset(n for n in slices.stochastic if n in problem.seen)
+    split = split_of(slices, known, engine.marginalize, problem.known_static)
+    if not split.inner:
+        return found | {n: f"{found[n]}; not integrated out: {w}" for n, w in split.why.items()}
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
         each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
