@@ -47,6 +47,8 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
+from bayesmc.engines.approximate.laplace import LaplaceApproximation
+from bayesmc.engines.approximate.posterior_mode import PosteriorMode, map
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
@@ -61,8 +63,9 @@ from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
-from bayesmc.engines.switching.propagation import ExpectationPropagation
+from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
@@ -79,6 +82,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Affine",
+    "AssumedDensity",
     "BayesNet",
     "Bernoulli",
     "Beta",
@@ -116,9 +120,11 @@ __all__ = [
     "KalmanFilter",
     "KernelDensity",
     "Laplace",
+    "LaplaceApproximation",
     "LikelihoodWeighting",
     "LogNormal",
     "Marginal",
+    "MeanField",
     "MetropolisHastings",
     "Mixture",
     "Multinomial",
@@ -132,6 +138,7 @@ __all__ = [
     "PlateArray",
     "Poisson",
     "Posterior",
+    "PosteriorMode",
     "RandomWalk",
     "Recovery",
     "Rejection",
@@ -153,6 +160,7 @@ __all__ = [
     "infer",
     "io",
     "log_density",
+    "map",
     "markov",
     "montecarlo",
     "most_likely",

@@ -5,17 +5,20 @@ from __future__ import annotations
 import sys
 
 from benchmarks import (
+    bench_approximate,
     bench_exact,
     bench_fading,
     bench_gaussian,
     bench_gibbs,
     bench_marginal,
+    bench_mean_field,
     bench_robot_logs,
     bench_robots,
     bench_scale,
     bench_switching,
     bench_time,
     bench_weighting,
+    prices,
 )
 from benchmarks.harness import data_folder, peer_python
 
@@ -37,7 +40,13 @@ if __name__ == "__main__":
     print()
     bench_switching.main()
     print()
+    bench_approximate.main()
+    print()
     bench_marginal.main()
+    print()
+    prices.main()
+    print()
+    bench_mean_field.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.mutants import (
+    approximate,
     chains,
     densities,
     draws,
@@ -12,18 +13,23 @@ from tests.mutants import (
     hamiltonian,
     lagging,
     linearised,
+    propagated,
     slices,
     switching,
+    variational,
 )
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
+    *approximate.MUTANTS,
     *chains.MUTANTS,
     *draws.MUTANTS,
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *variational.MUTANTS,
     *factored.MUTANTS,
+    *propagated.MUTANTS,
     *hamiltonian.MUTANTS,
     *lagging.MUTANTS,
     *linearised.MUTANTS,

@@ -118,8 +118,7 @@ class ParticleFilter(FilterEngine):
         weighted by the density of the row given these. ``"auto"``: all that can be, names: those; ``explain``
         says which. Means of named ones need not be affine: they are made linear at each particle's own mean
         (extended Kalman filters), so answers and evidence are approximations of unknown error then. With
-        ``proposal="optimal"`` finite sampled nodes are drawn given the row (the mixture Kalman filter).
-        ``particles`` of such nodes are a draw from each filter.
+        ``proposal="optimal"`` finite sampled nodes are drawn given the row. ``particles`` are draws.
     delay : int, optional
         How many rows answers look ahead: those for slice t are given the rows up to t + delay (at the end
         what there is), by the weights of slice t + delay on the ancestors in t; beliefs about what is
@@ -269,10 +268,9 @@ class ParticleFilter(FilterEngine):
         return told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
-        found = (
-            self.effort(problem) if asked.what == "filter" else marginal.back(self, problem, asked)
-        )
-        return ahead_told(self.delay, found)
+        if asked.what != "filter":
+            return ahead_told(self.delay, marginal.back(self, problem, asked))
+        return ahead_told(self.delay, self.effort(problem))
 
     def filter(
         self,
