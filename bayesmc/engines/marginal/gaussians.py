@@ -177,7 +177,8 @@ class Taken(NamedTuple):
         if choice.ndim == 1 and self.group is not None:
             count = self.factors.shape[1]
             pool, which = np.unique(self.group * count + choice, return_inverse=True)
-            factors = self.factors.reshape(-1, *self.factors.shape[2:]).take(pool, axis=0)
+            every = self.factors.reshape(len(self.factors) * count, *self.factors.shape[2:])
+            factors = every.take(pool, axis=0)
             return Gaussians(self.layout, mean, factors, which)
         every = self.factors if self.group is None else self.factors.take(self.group, axis=0)
         every = np.broadcast_to(every, (n, *every.shape[1:]))

@@ -67,7 +67,7 @@ def split_asked(
         return None
     known = frozenset(n for n in slices.stochastic if n in seen)
     found = split_of(slices, known, engine.marginalize, static)
-    return found if found.inner else None
+    return found if found.inner or found.tables is not None else None
 
 
 def split_of_problem(engine: Any, problem: SeriesProblem) -> Split | None:
@@ -87,7 +87,7 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     if split is None:
         return None
     slices = problem.slices
-    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.inner]
+    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.names]
     if engine.proposal == "optimal":
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:

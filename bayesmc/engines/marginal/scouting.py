@@ -38,7 +38,7 @@ class MarginalScouting(Scouting):
         self.step = step
         inner = step.integrated | step.split.seen
         sampled = [n for n in step.slices.stochastic if n not in inner]
-        if step.blocks or any(step.slices.later[n].domain is None for n in sampled):
+        if step.tables or step.blocks or any(step.slices.later[n].domain is None for n in sampled):
             self.nodes = ()
         self.nodes = tuple(n for n in self.nodes if n.name in sampled)
         self._choices: dict[int, Choices] = {}

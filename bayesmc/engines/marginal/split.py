@@ -10,17 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.kalman.reading import why_not_placed
 from bayesmc.engines.kalman.slices import Layout, always_unknown
+from bayesmc.engines.marginal.tables.plan import TablePlan
+from bayesmc.engines.marginal.tables.search import found_plan, is_finite, named_plan
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError, did_you_mean
 
 AUTO = "auto"
+_UNNAMED = "marginalize= does not name it"
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,21 @@ class Split:
     below : frozenset of str
         Nodes seen that depend on these.
     why : dict
-        Hidden number that is sampled -> why it is not integrated out.
+        Hidden node that is sampled -> why it is not integrated out.
+    tables : TablePlan or None
+        Finite nodes that are integrated out.
     """
 
     seen: frozenset[str]
     inner: tuple[str, ...]
     below: frozenset[str]
     why: Mapping[str, str] = field(default_factory=dict, hash=False)
+    tables: TablePlan | None = field(default=None, compare=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All nodes that are integrated out."""
+        return self.inner if self.tables is None else (*self.inner, *sorted(self.tables.names))
 
 
 def split_of(
@@ -68,8 +79,7 @@ def split_of(
     kept = slices.later.cache.setdefault("splits", {})
     key = (seen, asked, tuple((n, np.asarray(v).tobytes()) for n, v in static.items()))
     if key not in kept:
-        search = _Search(slices, seen, static)
-        kept[key] = search.found() if asked == AUTO else search.named(tuple(asked))
+        kept[key] = _found(slices, seen, asked, static)
     return kept[key]
 
 
@@ -78,6 +88,8 @@ def blocks_of(slices: Slices, split: Split) -> tuple[str, ...]:
 
     All that depends on what is integrated out lives in them, and reads its own element of it.
     """
+    if not split.inner:
+        return ()
     layouts = layouts_of(slices, split.inner, ())
     placed = {n for layout in layouts for n in (*layout.placed, *layout.silent)}
     some = next(iter(placed))
@@ -105,6 +117,28 @@ def layouts_of(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _found(
+    slices: Slices,
+    seen: frozenset[str],
+    asked: str | tuple[str, ...],
+    static: Mapping[str, np.ndarray],
+) -> Split:
+    """Numbers first, then finite nodes that these leave."""
+    search = _Search(slices, seen, static)
+    if asked == AUTO:
+        numbers = search.found()
+        apart_from = {*numbers.inner, *numbers.below}
+        tables, why = found_plan(slices, search.hidden, seen, apart_from, static)
+        met = set() if not numbers.inner else set(why)
+        why = {n: w for n, w in why.items() if n not in met or "linear-Gaussian" not in w}
+        return replace(numbers, why={**numbers.why, **why}, tables=tables)
+    finite = [n for n in asked if n in search.hidden and is_finite(slices, n)]
+    others = tuple(n for n in asked if n not in finite)
+    numbers = search.named(others, finite)
+    apart_from = {*numbers.inner, *numbers.below}
+    return replace(numbers, tables=named_plan(slices, finite, seen, apart_from, static))
 
 
 class _Search:
@@ -141,7 +175,9 @@ class _Search:
             inner = self._without(inner, self._given_up(inner, name), f"node {name!r} {reason}")
         return self._split(inner, self.why)
 
-    def named(self, names: tuple[str, ...]) -> Split:
+    def named(self, names: tuple[str, ...], finite: Collection[str] = ()) -> Split:
+        if not names and finite:
+            return self._split((), {n: _UNNAMED for n in self.hidden if n not in finite})
         for name in names:
             if name not in self.slices.dynamic:
                 raise UnsupportedError(
@@ -173,7 +209,7 @@ class _Search:
                 f"marginalize={list(names)} is not linear-Gaussian given the rest: node {name!r} {reason}; "
                 'name fewer, or give marginalize="auto"'
             )
-        why = {n: "marginalize= does not name it" for n in self.hidden if n not in inner}
+        why = {n: _UNNAMED for n in self.hidden if n not in inner and n not in finite}
         return self._split(inner, why)
 
     # ---- private -------------------------------------------------------------------------------
