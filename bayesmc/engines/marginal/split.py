@@ -17,7 +17,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.kalman.reading import why_not_placed
 from bayesmc.engines.kalman.slices import Layout, always_unknown
-from bayesmc.engines.marginal.tables.plan import TablePlan
+from bayesmc.engines.marginal.tables.plan import MET, TablePlan, nodes_read
 from bayesmc.engines.marginal.tables.search import found_plan, is_finite, named_plan
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError, did_you_mean
@@ -129,11 +129,14 @@ def _found(
     search = _Search(slices, seen, static)
     if asked == AUTO:
         numbers = search.found()
-        apart_from = {*numbers.inner, *numbers.below}
+        # what is measured and missing, of nothing that is integrated out, can as well wait for tables
+        loose = search.loose(numbers.inner)
+        apart_from = {*numbers.inner, *numbers.below} - loose
         tables, why = found_plan(slices, search.hidden, seen, apart_from, static)
-        met = set() if not numbers.inner else set(why)
-        why = {n: w for n, w in why.items() if n not in met or "linear-Gaussian" not in w}
-        return replace(numbers, why={**numbers.why, **why}, tables=tables)
+        waits = frozenset() if tables is None else loose & tables.below
+        inner = tuple(n for n in numbers.inner if n not in waits)
+        why = {n: w for n, w in why.items() if not w.endswith(MET)}
+        return replace(numbers, inner=inner, why={**numbers.why, **why}, tables=tables)
     finite = [n for n in asked if n in search.hidden and is_finite(slices, n)]
     others = tuple(n for n in asked if n not in finite)
     numbers = search.named(others, finite)
@@ -211,6 +214,11 @@ class _Search:
             )
         why = {n: _UNNAMED for n in self.hidden if n not in inner and n not in finite}
         return self._split(inner, why)
+
+    def loose(self, inner: Collection[str]) -> frozenset[str]:
+        """Numbers integrated out that depend on none of the others, and that nothing reads."""
+        read = nodes_read(self.slices)
+        return frozenset(n for n in inner if n not in read and not self._above((n,), inner))
 
     # ---- private -------------------------------------------------------------------------------
 

@@ -137,7 +137,7 @@ class MarginalStep(FilterStep):
             raise _degenerate(selection.particles, row)
         values |= inner.completed(rng)
         if self.tables is not None:
-            now, past = self.tables.completed(after, tables, moves, rng)
+            now, past = self.tables.completed(after, tables, moves, row, known, rng)
             values |= now
             every = {**known.values, **past, **values}
             out = self.tables.left_out(row.t == 0) - self.tables.plan.names

@@ -24,6 +24,8 @@ from bayesmc.factors.named import connected
 #: are integrated out, and up to which "auto" does so
 MOST_STATES, MOST_NUMBERS = 1024, 1 << 14
 AUTO_STATES, AUTO_NUMBERS = 256, 1 << 10
+#: how it is said that Kalman filters have a node that depends on a finite one
+MET = "and a Kalman filter takes it in"
 
 
 @dataclass(frozen=True, eq=False)
@@ -277,16 +279,16 @@ def _fault(
         if name in variables:
             continue
         if name in apart_from:
-            return Fault(others, f"{name!r}, which depends on it, is linear-Gaussian in others")
+            return Fault(others, f"{name!r} depends on it, {MET}")
         if name not in seen and name in read:
             return Fault(others, f"{name!r}, which is sampled, depends on it")
-    handed = {n + PREVIOUS for n in reader.dependent}
-    for name in slices.dynamic:
+    for name in slices.dynamic:  # what is computed, or missing, is worked out from a draw of two slices
         if name in reader.dependent or (name in reading and name not in seen):
-            past = sorted(handed.intersection(slices.later[name].parents))
-            if past:
-                every = tuple(n for n in slices.dynamic if n in variables)
-                return Fault(every, f"{name!r} depends on {past[0]!r}, which is computed from it")
+            for kind in (0, 1, 2):
+                fault = reader.look(name, kind).fault
+                if fault is not None:
+                    every = tuple(n for n in slices.dynamic if n in variables)
+                    return Fault(every, f"node {name!r} {fault}")
     return None
 
 

@@ -240,12 +240,8 @@ class TableFilter:
         self.lead = tuple(slices.first.sizes[p] for p in apart)
         self.steps = [GroupStep(plan, k) for k in range(len(plan.groups))]
         self.hidden_before = frozenset(n + PREVIOUS for n in plan.hidden)
-        #: whether what is drawn afterwards reads tables of two slices
-        self.ties = any(
-            p in self.hidden_before
-            for n in (*plan.below, *plan.computed)
-            for p in slices.later[n].parents
-        )
+        #: nodes of the slice before of which values are wanted afterwards, once tables are drawn from
+        self.wanted_before = self._wanted_before()
 
     def left_out(self, is_first: bool) -> frozenset[str]:
         """Nodes that wait for tables: those with one, and what depends on these in a slice."""
@@ -305,13 +301,15 @@ class TableFilter:
         tables: Tables,
         before: Tables | None,
         moves: Sequence[Moved],
+        row: Row,
+        known: Known,
         rng: np.random.Generator,
     ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-        """One draw of all nodes with a table, and where it is needed of the slice before with it."""
+        """One draw of all nodes with a table, and of the slice before with it what others read."""
         codes = tables.drawn(rng)
         nodes = [self.slices.later[n] for n in self.plan.names]
         now = tables.values(codes, nodes)
-        if not self.ties or before is None:
+        if not self.wanted_before or before is None:
             return now, {}
         earlier = []
         for own, log, moved in zip(codes, before.logs, moves, strict=True):
@@ -319,10 +317,34 @@ class TableFilter:
             pair = np.broadcast_to(moved.pair, (*log.shape, log.shape[-1]))
             column = np.take_along_axis(pair, own[..., None, None], -1)[..., 0]
             earlier.append(drawn(log + column, rng))
-        past = before.values(earlier, nodes)
-        return now, {n + PREVIOUS: v for n, v in past.items()}
+        past = {n + PREVIOUS: v for n, v in before.values(earlier, nodes).items()}
+        model = self.slices.model(row.t - 1)
+        for name in (n for n in model.nodes if n in self.wanted_before & self.plan.computed):
+            values = {**known.values, **past}
+            own = {p: values[p + PREVIOUS] for p in model[name].parents if p + PREVIOUS in values}
+            past[name + PREVIOUS] = model.evaluate(name, {**known.values, **own})[0]
+        return now, past
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _wanted_before(self) -> frozenset[str]:
+        """Of the nodes that wait, those whose values in the slice before others need that wait."""
+        found: set[str] = set()
+        todo = [
+            p.removesuffix(PREVIOUS)
+            for n in (*self.plan.below, *self.plan.computed)
+            for p in self.slices.later[n].parents
+            if p in self.hidden_before
+        ]
+        while todo:
+            name = todo.pop()
+            if name in found:
+                continue
+            found.add(name)
+            for model in (self.slices.first, self.slices.later):
+                if name in self.plan.computed:
+                    todo += [p for p in model[name].parents if p in self.plan.hidden]
+        return frozenset(found)
 
     def _by_apart(self, sums: np.ndarray) -> np.ndarray:
         """Logs of all tables of a particle added, but for plates that are filtered separately."""
