@@ -10,6 +10,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
 from bayesmc.engines.marginal.choices import MOST
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.marginal.tables.telling import tables_told
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
@@ -111,7 +112,7 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         return None
     for proposal in [] if asked is None else [*asked.first, *asked.later]:
         names = (*proposal.names, *proposal.parents)
-        inner = next((n for n in names if n.removesuffix(PREVIOUS) in split.inner), None)
+        inner = next((n for n in names if n.removesuffix(PREVIOUS) in split.waiting), None)
         if inner is not None:
             return (
                 f"{proposal.what} names {inner!r}, which marginalize= integrates out, so no particle has a "
@@ -125,7 +126,8 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     split = split_of_problem(engine, problem)
     if split is None:
         return ()
-    inner = ", ".join(repr(n) for n in split.inner if n not in problem.series.observed)
+    seen = problem.series.observed
+    inner = ", ".join(repr(n) for n in split.names if n not in seen or n not in split.inner)
     return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
 
 
@@ -152,4 +154,14 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
             engine.proposal == "optimal" and name in slices.stochastic and name not in problem.seen
         ):
             found[name] = "sampled given the slice before and the row"
+    if split.tables is not None:
+        found |= tables_told(split.tables, problem)
     return found
+
+
+def effort_told(engine: Any, problem: SeriesProblem) -> str:
+    """What a slice takes, where something is integrated out."""
+    split = split_of_problem(engine, problem)
+    assert split is not None
+    parts = ["a Kalman filter"] * bool(split.inner) + ["tables"] * (split.tables is not None)
+    return f"{' and '.join(parts)} for each particle"

@@ -55,6 +55,13 @@ class Split:
         """All nodes that are integrated out."""
         return self.inner if self.tables is None else (*self.inner, *sorted(self.tables.names))
 
+    @property
+    def waiting(self) -> frozenset[str]:
+        """These, and what is worked out after them, of which no particle has a value that others may read."""
+        tables = self.tables
+        late = frozenset() if tables is None else tables.computed | (tables.below - self.seen)
+        return late.union(self.names)
+
 
 def split_of(
     slices: Slices,

@@ -264,8 +264,9 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
-        filters = "a Kalman filter for each particle"
-        return filters if step.integrated else told(step, problem, self.compiled)
+        if step.integrated:
+            return marginal.effort_told(self, problem)
+        return told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
         return self.effort(problem) if asked.what == "filter" else ""

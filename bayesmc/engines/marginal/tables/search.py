@@ -66,11 +66,15 @@ def found_plan(
         if isinstance(found, TablePlan):
             return _with_more(found, names, why, plan)
         if not found.is_size:
-            out: Collection[str] = found.nodes or names
+            first: Sequence[str] = found.nodes or names
         else:
-            out = (_given_up(slices, names, found, plan),)
-        out = _closed(slices, names, out)
-        why.update(dict.fromkeys(out, found.reason))
+            first = (_given_up(slices, names, found, plan),)
+        out = _closed(slices, names, first)
+        for name in out:
+            by = f"{first[0]!r}, which is sampled, depends on it"
+            why[name] = found.reason if name in first else by
+        if found.is_size and len(found.nodes) > 1:
+            why[first[0]] += "; without it they are the smallest"
         names = [n for n in names if n not in out]
     return None, why
 
