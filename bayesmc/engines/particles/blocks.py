@@ -119,7 +119,7 @@ class Block:
         return found
 
     def state_rows(self, node: CompiledNode) -> np.ndarray | None:
-        """What each particle's own table says: ``(slices, elements, numbers, states, particles)``, or None."""
+        """What each particle's table says: ``(slices, elements, numbers, states, particles)``, or None."""
         if not has_table(self.slices[0], node):
             return None
         key = ("tables", node.name)

@@ -126,7 +126,9 @@ def node_errors(by: Variances, block: Block, node: CompiledNode) -> np.ndarray:
     else:
         off, shares, step = _of_states(block, node)
         found = by.variances(off)
-        if not has_table(block.slices[0], node):  # what no particle has met has its share of a table
+        if not has_table(
+            block.slices[0], node
+        ):  # what no particle has met has its share of a table
             found = np.maximum(found, step**2 * _unseen(shares, by.worth))
         by.missed(found, shares, by.at_scouts(node), step)
     return block.unturned(np.sqrt(found), node, more)

@@ -264,9 +264,8 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
-        if step.integrated:
-            return marginal.effort_told(self, problem)
-        return told(step, problem, self.compiled)
+        own = marginal.effort_told(self, problem) if step.integrated else ""
+        return own or told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
         return self.effort(problem) if asked.what == "filter" else ""

@@ -33,7 +33,10 @@ def table_quantiles(
 
 
 def table_covariance(
-    tables: Tables, nodes: Sequence[CompiledNode], numbers: Mapping[str, np.ndarray], shares: np.ndarray
+    tables: Tables,
+    nodes: Sequence[CompiledNode],
+    numbers: Mapping[str, np.ndarray],
+    shares: np.ndarray,
 ) -> np.ndarray:
     """Mean of the particles' covariances of nodes one after the other; 0 for what has no table.
 

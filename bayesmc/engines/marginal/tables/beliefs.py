@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -51,7 +50,9 @@ class Tables(NamedTuple):
         """A joint state of each table, shapes ``(particles, elements)``."""
         return [drawn(log, rng) for log in self.logs]
 
-    def values(self, codes: Sequence[np.ndarray], nodes: Sequence[CompiledNode]) -> dict[str, np.ndarray]:
+    def values(
+        self, codes: Sequence[np.ndarray], nodes: Sequence[CompiledNode]
+    ) -> dict[str, np.ndarray]:
         """Stored values of nodes at joint states, shape ``(particles, *plates)``."""
         found = {}
         for group, own in zip(self.groups, codes, strict=True):

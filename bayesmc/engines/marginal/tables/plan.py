@@ -77,7 +77,7 @@ class Group:
         return tuple((lag, n, e) for n, e in self.variables)
 
     def probabilities(self, tables: np.ndarray, name: str) -> np.ndarray:
-        """Of a node's states by tables ``(particles, elements, states)``: ``(particles, *plates, states)``."""
+        """Of a node's states, ``(particles, *plates, states)``, by tables of all joint states."""
         n = len(tables)
         whole = tables.reshape(n * self.elements, *self.sizes)
         parts = []
@@ -193,9 +193,7 @@ def planned(
     variables = frozenset(names)
     apart = plates_apart(slices)
     reader = TableReader(slices, apart, variables, static)
-    looks = {
-        (n, k): reader.look(n, k) for n in slices.stochastic for k in (0, 1, 2)
-    }
+    looks = {(n, k): reader.look(n, k) for n in slices.stochastic for k in (0, 1, 2)}
     reading = [n for n in slices.stochastic if any(looks[n, k].names for k in (0, 1, 2))]
     fault = _fault(slices, variables, reader, looks, reading, seen, apart_from)
     if fault is not None:
@@ -218,9 +216,7 @@ def planned(
         fault = _too_large(group, looks, limits)
         if fault is not None:
             return fault
-    readers = tuple(
-        TableReader(slices, g.plates, frozenset(g.names), static) for g in groups
-    )
+    readers = tuple(TableReader(slices, g.plates, frozenset(g.names), static) for g in groups)
     for own in readers:
         own.dependent = reader.dependent
     found = {}
@@ -282,7 +278,9 @@ def _fault(
             return Fault(others, f"{name!r} depends on it, {MET}")
         if name not in seen and name in read:
             return Fault(others, f"{name!r}, which is sampled, depends on it")
-    for name in slices.dynamic:  # what is computed, or missing, is worked out from a draw of two slices
+    for (
+        name
+    ) in slices.dynamic:  # what is computed, or missing, is worked out from a draw of two slices
         if name in reader.dependent or (name in reading and name not in seen):
             for kind in (0, 1, 2):
                 fault = reader.look(name, kind).fault
@@ -353,6 +351,8 @@ def _too_large(
     )
     each = group.elements * states * (states if moves else 1.0)
     if each > numbers:
-        reason = f"tables of {what} would be {each:.3g} numbers for each particle, more than {numbers}"
+        reason = (
+            f"tables of {what} would be {each:.3g} numbers for each particle, more than {numbers}"
+        )
         return Fault(group.names, reason, True)
     return None

@@ -218,10 +218,10 @@ class TableReader(SliceReader):
         """
         log, bad = self._log_tables(look.term, rows)
         node = self.slices.first[look.term.name]
-        count = 1 + len(look.term.alone)
+        cards = self.cards(look.term)
 
         def flat(array: np.ndarray) -> np.ndarray:
-            lead = padded(array, count + len(node.plates)).shape[:count]
+            lead = (len(padded(array, 1 + len(cards) + len(node.plates))), *cards)
             return np.broadcast_to(array, lead + node.plate_shape).reshape(
                 *lead, math.prod(node.plate_shape)
             )

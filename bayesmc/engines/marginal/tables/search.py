@@ -105,7 +105,8 @@ def named_plan(
     else:
         remedy = f"leave {', '.join(map(repr, found.nodes))} out"
     raise UnsupportedError(
-        f"marginalize= names {found.nodes[0]!r}, which has no table for each particle: {found.reason}; {remedy}"
+        f"marginalize= names {found.nodes[0]!r}, which has no table for each particle: {found.reason}; "
+        f"{remedy}"
     )
 
 
