@@ -88,7 +88,7 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     if split is None:
         return None
     slices = problem.slices
-    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.names]
+    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.waiting]
     if engine.proposal == "optimal":
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:
