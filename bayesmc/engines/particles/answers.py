@@ -151,11 +151,10 @@ class Answers(NamedTuple):
         flat, shares = np.concatenate(columns, axis=1).astype(float), now.weights / now.total
         flat = flat - shares @ flat
         matrix = (flat * shares[:, None]).T @ flat
-        if now.inner is not None:
-            nodes = [self.model[name] for name in names]
+        nodes = [self.model[name] for name in names]
+        if now.inner is not None and any(now.inner.has(name) for name in names):
             matrix += covariance_within(now.inner, nodes, shares)
         if now.tables is not None:
-            nodes = [self.model[name] for name in names]
             numbers = {n.name: numbers_of(n) for n in nodes if has_table(now, n)}
             matrix += table_covariance(now.tables, nodes, numbers, shares)
         return matrix[0, 0] if matrix.size == 1 else matrix
