@@ -13,11 +13,13 @@ import importlib.util
 import os
 import stat
 import tempfile
+import warnings
 from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
+from bayesmc.errors import EngineWarning, TraceError
 from bayesmc.lowering.kernel import DIRECT, ENTRY
 from bayesmc.lowering.ufuncs import SCIPY
 
@@ -28,7 +30,7 @@ _MARK = b"bayesmc machine code 1\n"
 
 @lru_cache(maxsize=1)
 def is_available() -> bool:
-    """Whether there is a compiler, without importing it."""
+    """Whether there is a compiler, without importing it; one that does not load is found out at first use."""
     return importlib.util.find_spec("llvmlite") is not None
 
 
@@ -167,9 +169,20 @@ def _tidy(folder: Path) -> None:
 
 @lru_cache(maxsize=1)
 def _compiler() -> tuple[Any, Any, str]:
-    """llvmlite, what makes a target machine, and what tells this compiler and processor from others."""
-    import llvmlite
-    from llvmlite import binding
+    """llvmlite, what makes a target machine, and what tells this compiler and processor from others.
+
+    Raises
+    ------
+    TraceError
+        It is there, but does not load.
+    """
+    try:
+        import llvmlite
+        from llvmlite import binding
+    except (ImportError, OSError, RuntimeError) as error:
+        why = f"llvmlite is installed, but does not load ({type(error).__name__}: {error})"
+        _warn_once(why)
+        raise TraceError(why) from None
 
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
@@ -184,6 +197,15 @@ def _compiler() -> tuple[Any, Any, str]:
     version = ".".join(map(str, binding.llvm_version_info))
     identity = f"{llvmlite.__version__} {version} {target.triple} {cpu} {features}"
     return binding, machine, identity
+
+
+@lru_cache(maxsize=1)
+def _warn_once(why: str) -> None:
+    warnings.warn(
+        f"{why}: NumPy does the work of machine code; reinstall llvmlite, or uninstall it",
+        EngineWarning,
+        stacklevel=2,
+    )
 
 
 def _compiled(text: str) -> bytes:

@@ -138,3 +138,34 @@ def test_without_llvmlite_nothing_is_compiled(monkeypatch: pytest.MonkeyPatch) -
 def test_llvmlite_is_imported_when_something_is_compiled() -> None:
     script = "import sys, bayesmc, bayesmc.lowering; sys.exit('llvmlite' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script], check=False).returncode == 0
+
+
+BROKEN = """
+import sys, warnings
+import numpy as np
+import bayesmc as bmc
+net = bmc.BayesNet(plates={"i": 50})
+net.add("mu", bmc.Normal(0.0, 5.0))
+net.add("y", lambda mu: bmc.StudentT(4.0, mu, 1.0), plates="i")
+y = np.random.default_rng(0).normal(size=50)
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    for engine in (bmc.HamiltonianMonteCarlo(), bmc.Gibbs(compiled=True), bmc.Gibbs()):
+        assert abs(bmc.infer(net, {"y": y}, engine=engine, rng=0).mean("mu")) < 1.0
+words = [str(w.message) for w in caught if "llvmlite" in str(w.message)]
+assert len(words) == 1 and "libffi" in words[0] and "reinstall" in words[0], words
+"""
+
+
+def test_llvmlite_that_does_not_load_is_named_and_numpy_does_the_work(tmp_path: Path) -> None:
+    (tmp_path / "llvmlite").mkdir()
+    (tmp_path / "llvmlite" / "__init__.py").write_text("raise OSError('libffi.so.6 is missing')\n")
+    there = os.pathsep.join([str(tmp_path), *(p for p in sys.path if p)])
+    found = subprocess.run(
+        [sys.executable, "-c", BROKEN],
+        env=os.environ | {"PYTHONPATH": there},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert found.returncode == 0, found.stderr

@@ -37,8 +37,8 @@ from bayesmc.randomness import Purpose, stream
 
 #: joint states of a cluster, and entries of a chain's tables in a slice, up to which clusters are merged
 STATES, ENTRIES = 1 << 8, 1 << 17
-#: entries of the same with single nodes above which nothing is measured
-MEASURABLE = 1 << 22
+#: numbers that measuring may go through (a second or so); above, nothing is measured
+MEASURABLE = 1 << 26
 #: nats a slice below which two nodes have nothing to do with each other
 _NOTHING = 1e-9
 #: slices that are drawn, and those of them in which is measured
@@ -60,7 +60,7 @@ def coupled_clusters(
     """
     readings = _readings(slices)
     plan = FactoredSlices(slices, apart, readings, static, True, frozenset(), singles)
-    if max((plan.tree(k, 2).entries for k in range(len(plan.chains))), default=0.0) > MEASURABLE:
+    if _work(plan) > MEASURABLE:
         return singles(plan)
     try:
         with quiet():
@@ -122,6 +122,14 @@ def _drawn(
             found.append(np.broadcast_to(value, (1, *shape))[0])
         before = {n + PREVIOUS: values[n] for n in slices.interface}
     return Series(_STEPS, {n: Observed(np.stack(v)) for n, v in seen.items()}, rows)
+
+
+def _work(plan: FactoredSlices) -> float:
+    """Numbers that a measurement goes through: a pass over the slices, and a joint table of every pair."""
+    return sum(
+        plan.tree(k, 2).entries * (_STEPS + len(_MEASURED) * len(_pairs(plan, k)))
+        for k in range(len(plan.chains))
+    )
 
 
 def _pairs(plan: FactoredSlices, number: int) -> list[tuple[Variable, Variable]]:
