@@ -20,6 +20,8 @@ NOT_LAGGED = (
     "marginalize= integrates out; smooth without lag=, or give marginalize=None"
 )
 _SEEN = "observed, weights the particles by its predictive density"
+#: questions about slices given rows that come after them
+PAST = ("smooth", "fixed-lag")
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
 
@@ -67,13 +69,34 @@ def split_asked(
     if engine.marginalize is None:
         return None
     known = frozenset(n for n in slices.stochastic if n in seen)
-    found = split_of(slices, known, engine.marginalize, static)
+    tabled = getattr(engine, "tabled", True) and not getattr(engine, "delay", None)
+    found = split_of(slices, known, engine.marginalize, static, tabled)
     return found if found.inner or found.tables is not None else None
 
 
 def split_of_problem(engine: Any, problem: SeriesProblem) -> Split | None:
     """The same for a series."""
     return split_asked(engine, problem.slices, problem.known_static, problem.seen)
+
+
+def without_tables(engine: Any, what: str) -> Any:
+    """The same engine without tables of finite nodes where a question is about the past: they know none."""
+    if what not in PAST or getattr(engine, "marginalize", None) is None:
+        return engine
+    found = object.__new__(type(engine))
+    found.__dict__.update(engine.__dict__, tabled=False)
+    return found
+
+
+def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | None:
+    """Why a question about the past has no answer, or None."""
+    if what not in PAST:
+        return None
+    try:
+        split = split_of_problem(without_tables(engine, what), problem)
+    except UnsupportedError as error:
+        return f"ParticleFilter: {error}"
+    return NOT_LAGGED if what == "fixed-lag" and split is not None else None
 
 
 def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:

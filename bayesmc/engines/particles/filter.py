@@ -112,10 +112,10 @@ class ParticleFilter(FilterEngine):
 
     marginalize : "auto", sequence of str, or None
         Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
-        given the sampled ones, each particle with a Kalman filter of its own, all in one array operation, and
-        weighted by the density of the row given these. ``"auto"``: all that can be, names: those, None: none.
-        ``explain`` says which, and why not more. With ``proposal="optimal"`` finite sampled nodes are drawn
-        given the row (the mixture Kalman filter). ``particles`` of such nodes are a draw from each filter.
+        given the sampled ones, each particle with a Kalman filter, and finite ones, with a table (or one for
+        each element of a plate); particles are weighted by the density of the row given these. ``"auto"``: all
+        that can be, names: those, None: none; ``explain`` says which, and why not more. With
+        ``proposal="optimal"`` finite sampled nodes are drawn given the row. ``particles`` are draws of these.
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
@@ -248,8 +248,8 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if asked.what == "fixed-lag" and self._integrates(problem):
-            return marginal.NOT_LAGGED
+        if (why := marginal.not_of_the_past(self, problem, asked.what)) is not None:
+            return why
         sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
@@ -309,12 +309,12 @@ class ParticleFilter(FilterEngine):
             what = "or None for as many as there are particles, 1,000 at most"
             check_count("trajectories", trajectories, what, "smooth")
         check_choice("backward", backward, "rejection", "exact", "smooth")
-        why = self.unable(problem, Asked("smooth" if lag is None else "fixed-lag"))
-        if why is not None:
+        if why := self.unable(problem, Asked("smooth" if lag is None else "fixed-lag")):
             raise UnsupportedError(why)
-        if not self._integrates(problem):
+        own: ParticleFilter = marginal.without_tables(self, "smooth")
+        if not own._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
-        sized = self._sized(self._enough(problem, seed, lag is None, progress))
+        sized = own._sized(own._enough(problem, seed, lag is None, progress))
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
         else:
