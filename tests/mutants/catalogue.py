@@ -12,6 +12,7 @@ from tests.mutants import (
     hamiltonian,
     slices,
     switching,
+    tables,
 )
 from tests.mutants.mutant import Mutant
 
@@ -21,6 +22,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *tables.MUTANTS,
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *slices.MUTANTS,

@@ -112,10 +112,10 @@ class ParticleFilter(FilterEngine):
 
     marginalize : "auto", sequence of str, or None
         Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
-        given the sampled ones, each particle with a Kalman filter, and finite ones, with a table (or one for
-        each element of a plate); particles are weighted by the density of the row given these. ``"auto"``: all
-        that can be, names: those, None: none; ``explain`` says which, and why not more. With
-        ``proposal="optimal"`` finite sampled nodes are drawn given the row. ``particles`` are draws of these.
+        given the sampled ones, each particle with a Kalman filter, and finite ones, each with a table (or one
+        for each element of a plate); the density of the row given these weighs. ``"auto"``: what can be,
+        names: those, None: none. ``explain`` says which, and why not more. With ``proposal="optimal"`` finite
+        sampled nodes are drawn given the row. ``particles`` of what is integrated out are draws.
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
