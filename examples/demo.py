@@ -14,6 +14,7 @@ from examples import (
     bimodal_mixture,
     ceiling_robot,
     central_limit,
+    colour_map,
     corridor_doors,
     coupled_chains,
     diagnosis,
@@ -47,7 +48,7 @@ FIGURES = (
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
     banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, coupled_chains, switching_target,
+    landmark_localization, range_only, coupled_chains, switching_target, colour_map,
 )  # fmt: skip
 
 
