@@ -125,7 +125,7 @@ def corridor(walks: int, steps: int) -> dict[str, np.ndarray]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     asked = picture.options(__doc__, arguments)
-    walks, steps = (2, 15) if asked.fast else (10, 60)
+    walks, steps = (2, 8) if asked.fast else (10, 60)
     found = corridor(walks, steps)
     print(
         f"8 cells, {walks} walks of {steps} readings, {PARTICLES} particles; mean probability of the truth"
@@ -133,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name, own in found.items():
         place, color = own.mean(axis=0)
         print(f"  {name:16s} place {place:.3f}, map {color:.3f}")
-    steps = 128 if asked.fast else 512
+    steps = 64 if asked.fast else 512
     dbn, walk = hall(8, 8), sweep(8, 8, steps, np.random.default_rng(7))
     filtered(dbn, Walk(walk.color, *(part[:3] for part in walk[1:])), by_tables())
     start = time.perf_counter()

@@ -171,12 +171,12 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
                 found[name] = f"{_SEEN}; integrated out where it is missing"
         elif name in split.below:
             found[name] = _SEEN
-        elif name in split.why:
-            found[name] += f"; not integrated out: {split.why[name]}"
-        elif (
-            engine.proposal == "optimal" and name in slices.stochastic and name not in problem.seen
-        ):
-            found[name] = "sampled given the slice before and the row"
+        else:
+            drawn = name in slices.stochastic and name not in problem.seen
+            if drawn and engine.proposal == "optimal":
+                found[name] = "sampled given the slice before and the row"
+            if name in split.why:
+                found[name] += f"; not integrated out: {split.why[name]}"
     if split.tables is not None:
         found |= tables_told(split.tables, problem)
     return found

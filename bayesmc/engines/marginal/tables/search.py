@@ -74,7 +74,7 @@ def found_plan(
             by = f"{first[0]!r}, which is sampled, depends on it"
             why[name] = found.reason if name in first else by
         if found.is_size and len(found.nodes) > 1:
-            why[first[0]] += "; without it they are the smallest"
+            why[first[0]] += "; sampling it leaves the smallest tables"
         names = [n for n in names if n not in out]
     return None, why
 
