@@ -104,8 +104,8 @@ MUTANTS = [
     Mutant(
         "a gradient is stale: what others moved is not read anew",
         (Edit("bayesmc.kernels.hamiltonian:Hamiltonian._place", "same and not self.given", "same"),),
-        trajectories(0.8, 400),
-        OF.format(400),
+        trajectories(0.8, 150),
+        OF.format(150),
     ),
     Mutant(
         "an unsymmetric tree: time goes forwards only",

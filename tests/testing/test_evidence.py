@@ -308,8 +308,8 @@ def test_static_nodes_that_a_filter_knows_are_no_evidence() -> None:
     dbn.add("y", lambda x: bmc.Normal(x, 1.0))
     rows = {"m": 1.3, "y": [0.3, 1.1]}
     for engine in (bmc.ParticleFilter(20), bmc.KalmanFilter()):
-        assert unbiased_evidence_test(engine, dbn, rows, replications=200, alpha=1e-4, rng=0)
-        options = {"replications": 200, "alpha": 1e-4, "rng": 0}
+        assert unbiased_evidence_test(engine, dbn, rows, replications=100, alpha=1e-4, rng=0)
+        options = {"replications": 100, "alpha": 1e-4, "rng": 0}
         assert unbiased_evidence_test(engine, dbn, rows, exact=exact(dbn, rows), **options)
         whole = exact(dbn, rows).log_marginal_likelihood
         assert not unbiased_evidence_test(engine, dbn, rows, exact=whole, **options)

@@ -138,8 +138,8 @@ def looking_ahead() -> bmc.BayesNet:
 
 
 ENGINES: dict[str, tuple[Callable[[], bmc.BayesNet], Any, dict[str, Any]]] = {
-    "tables": (labelled, bmc.Gibbs(), {"replications": 200}),
-    "conjugate and slice": (normal, bmc.Gibbs(), {"replications": 80}),
+    "tables": (labelled, bmc.Gibbs(), {"replications": 100}),
+    "conjugate and slice": (normal, bmc.Gibbs(), {"replications": 40}),
     "ensembles": (normal, bmc.MetropolisHastings(warmup=100), {"replications": 400}),
     "proposals": (
         normal,
