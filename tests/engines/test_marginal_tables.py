@@ -185,7 +185,7 @@ def asked_of(name: str, observations: Mapping[str, Any]) -> dict[str, Any]:
 def test_without_sampled_nodes_every_particle_is_the_exact_filter() -> None:
     """Random templates: plates, plates apart, computed nodes handed on, rows partly seen; to rounding."""
     asked = 0
-    for seed in range(session.scaled(30, 10)):
+    for seed in range(session.scaled(24, 10)):
         case = random_dbn(seed, nodes=(1, 4), steps=(2, 5))
         given: dict[str, Any] = {"inputs": case.inputs or None}
         try:
@@ -268,18 +268,18 @@ def test_filtered_figures_are_exact_ones_under_holm(name: str, proposal: str | N
         return made
 
     truth = {"evidence": np.ones_like(total), **figures(right)}
-    runs = session.scaled(40, 8)
+    runs = session.scaled(25, 10)
     verdict = repeated_test(estimate, truth, replications=runs, alpha=1e-3, rng=[7, 1])
     assert verdict, verdict
 
 
 def test_errors_are_as_large_as_they_say() -> None:
-    """Stated errors of the evidence and of a map, beside the spread of 30 runs: 2 times, or 1.6 less."""
+    """Stated errors of the evidence and of a map, beside the spread of 20 runs: 2 times, or 1.6 less."""
     dbn, rows = ring(8, 0.05), {"reading": [1, 0, 0, 1, 1, 0, 1, 1, 0, 0, 1, 1, 0, 1, 0]}
     right = bmc.filter(dbn, rows, engine=bmc.DiscreteFilter())
     engine = bmc.ParticleFilter(200, marginalize=["color"])
     logs, stated, maps, errors = [], [], [], []
-    for seed in range(session.scaled(30, 4)):
+    for seed in range(session.scaled(20, 5)):
         found = bmc.filter(dbn, rows, engine=engine, rng=seed)
         logs.append(found.log_marginal_likelihood - right.log_marginal_likelihood)
         stated.append(found.log_marginal_likelihood_mcse)
@@ -345,7 +345,7 @@ def test_a_map_of_eight_cells_is_located_in_as_by_the_exact_filter() -> None:
     engines = {"tables": {"marginalize": "auto", "proposal": "optimal"}, "plain": {}}
     shares: dict[str, list[float]] = {name: [] for name in ("exact", *engines)}
     gaps, errors = [], []
-    for seed in range(session.scaled(12, 8)):
+    for seed in range(session.scaled(8, 8)):
         places, readings, move = sweeps(rng, steps, slip)
         right = located(readings, move, slip)
         shares["exact"].append(right[np.arange(steps), places].mean())
@@ -366,7 +366,7 @@ def test_a_map_of_eight_cells_is_located_in_as_by_the_exact_filter() -> None:
     assert abs(less["tables"].mean()) < 4 * error and error < 0.03
     assert less["plain"].mean() < -0.05 < less["tables"].mean()
     gap, stated = np.concatenate(gaps), np.concatenate(errors)
-    assert len(gap) > 0.6 * steps * len(shares["exact"])
+    assert len(gap) > 0.4 * steps * len(shares["exact"])
     assert np.sqrt(np.mean(gap**2)) < 1.5 * np.sqrt(np.mean(stated**2))
 
 
@@ -539,3 +539,28 @@ def test_of_the_past_tables_say_nothing() -> None:
         dbn, rows, engine=bmc.ParticleFilter(100, marginalize="auto"), question="smooth"
     ).nodes
     assert nodes["color"] == "sampled given its parents"
+
+
+def test_places_where_no_particle_is_are_looked_after_by_scouts() -> None:
+    """A jump of one in a thousand, which readings show: who missed it says that nothing is known."""
+    dbn = ring(8)
+    dbn.add(
+        "color",
+        lambda color_prev: bmc.Bernoulli(color_prev),
+        initial=bmc.Bernoulli(np.where(np.arange(8) < 4, 0.9, 0.1)),
+        plates="cell",
+        replace=True,
+    )
+    step = 0.999 * np.eye(8) + 0.001 * np.roll(np.eye(8), 4, axis=1)
+    dbn.table("place", ["place_prev"], step, initial=np.eye(8)[0], replace=True)
+    rows = {"reading": [1] * 3 + [0] * 6}
+    right = bmc.filter(dbn, rows, engine=bmc.DiscreteFilter()).log_marginal_likelihood
+    missed = []
+    for seed in range(12):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LowEssWarning)
+            engine = bmc.ParticleFilter(60, marginalize=["color"])
+            found = bmc.filter(dbn, rows, engine=engine, rng=seed)
+        if abs(found.log_marginal_likelihood - right) > 2.0:
+            missed.append(np.isinf(found.log_marginal_likelihood_mcse))
+    assert len(missed) > 5 and np.mean(missed) > 0.8, missed

@@ -28,6 +28,7 @@ from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split, blocks_of
 from bayesmc.engines.marginal.tables.afterwards import drawn_afterwards
 from bayesmc.engines.marginal.tables.beliefs import Tables
+from bayesmc.engines.marginal.tables.groups import Moved
 from bayesmc.engines.marginal.tables.step import Known, TableFilter
 from bayesmc.engines.particles.filter_step import FilterStep, has_weight
 from bayesmc.engines.particles.smc import Particles, Selection
@@ -112,9 +113,7 @@ class MarginalStep(FilterStep):
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
         place = self.place(row, None if earlier is None else earlier.inner)
         before, selection = self.chosen(earlier, row, rng)
-        hidden = place.reader.hidden_before
-        if self.tables is not None:
-            hidden |= self.tables.hidden_before
+        hidden = self.hidden_before(place)
         before = {k: v for k, v in before.items() if k not in hidden}
         inner = nothing(place.layout, selection.particles)
         tables = None
@@ -137,14 +136,31 @@ class MarginalStep(FilterStep):
             raise _degenerate(selection.particles, row)
         values |= inner.completed(rng)
         if self.tables is not None:
-            now, past = self.tables.completed(after, tables, moves, row, known, rng)
-            values |= now
-            every = {**known.values, **past, **values}
-            out = self.tables.left_out(row.t == 0) - self.tables.plan.names
-            values |= drawn_afterwards(self.slices, row, out, every, known.particles, rng)
+            values |= self.completed(row, known, values, (tables, after, moves), rng)
         for name in [n for n in values if n not in self.kept]:
             del values[name]
         return found._replace(inner=inner._replace(seen=self.split.seen), tables=after)
+
+    def hidden_before(self, place: Place) -> frozenset[str]:
+        """Nodes of the slice before of which no particle has a value that others may read."""
+        hidden = place.reader.hidden_before
+        return hidden if self.tables is None else hidden | self.tables.hidden_before
+
+    def completed(
+        self,
+        row: Row,
+        known: Known,
+        values: Mapping[str, np.ndarray],
+        tables: tuple[Tables | None, Tables, Sequence[Moved]],
+        rng: np.random.Generator,
+    ) -> dict[str, np.ndarray]:
+        """A draw of all nodes with tables, and of what waits for these: tables before, now, and between."""
+        assert self.tables is not None
+        before, after, moves = tables
+        now, past = self.tables.completed(after, before, moves, row, known, rng)
+        every = {**known.values, **past, **values, **now}
+        out = self.tables.left_out(row.t == 0) - self.tables.plan.names
+        return now | drawn_afterwards(self.slices, row, out, every, known.particles, rng)
 
     def stored(self, row: Any, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """All values of the slice that particles have; those that are not kept go later."""

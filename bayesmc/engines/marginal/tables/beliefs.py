@@ -37,6 +37,11 @@ class Tables(NamedTuple):
             found.append(moved.reshape(len(ancestors), *log.shape[1:]))
         return self._replace(logs=tuple(found))
 
+    def joined(self, parties: Sequence[Tables], at: np.ndarray) -> Tables:
+        """Some of those of several parties, one after the other."""
+        logs = (np.concatenate(own)[at] for own in zip(*(p.logs for p in parties), strict=True))
+        return self._replace(logs=tuple(logs))
+
     def has(self, name: str) -> bool:
         """Whether there is a table about a node."""
         return any(name in g.names for g in self.groups)
