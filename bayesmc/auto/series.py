@@ -17,7 +17,7 @@ from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.marginal.options import split_of_problem, without_tables
+from bayesmc.engines.marginal.options import is_worth_it, without_tables
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
@@ -327,7 +327,7 @@ def _made(candidate: type[FilterEngine], problem: SeriesProblem, asked: Asked) -
     if candidate is ParticleFilter and common_refusal(ParticleFilter(), problem) is None:
         engine = ParticleFilter(marginalize="auto")
         if (
-            split_of_problem(without_tables(engine, asked.what), problem)
+            is_worth_it(without_tables(engine, asked.what), problem)
             and _why_not(engine, problem, asked) is None
         ):
             return engine

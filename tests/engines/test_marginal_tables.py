@@ -564,3 +564,42 @@ def test_places_where_no_particle_is_are_looked_after_by_scouts() -> None:
         if abs(found.log_marginal_likelihood - right) > 2.0:
             missed.append(np.isinf(found.log_marginal_likelihood_mcse))
     assert len(missed) > 5 and np.mean(missed) > 0.8, missed
+
+
+def test_what_tables_cannot_take_in_is_refused_by_name() -> None:
+    """Vectors seen in part; a sensor that is missing, and that a sampled node reads."""
+    dbn = ring(3)
+    dbn.add(
+        "pair",
+        lambda color, place: bmc.MvNormal(bmc.stack([color[place], 0.0 * place], -1), np.eye(2)),
+    )
+    engine = bmc.ParticleFilter(20, marginalize=["color"])
+    rows = {"reading": [1, 0], "pair": np.array([[0.1, np.nan], [0.2, 0.3]])}
+    reason = engine.unsupported(dbn, rows)
+    assert reason is not None and "of 'pair' some components are missing" in reason
+    dbn = ring(3)
+    dbn.add(
+        "place",
+        lambda place_prev, reading_prev: bmc.Categorical(walk(3)[(place_prev + reading_prev) % 3]),
+        initial=bmc.Categorical([1.0, 0.0, 0.0]),
+        replace=True,
+    )
+    belief = engine.step(engine.start(dbn, rng=0), {"reading": 1})
+    with pytest.raises(UnsupportedError, match="'reading' is missing in slice 1, and 'place'"):
+        engine.step(belief, {})
+    reason = engine.unsupported(dbn, {"reading": [1, np.nan]})
+    assert reason is not None and "'reading', which is sampled, depends on it" in reason
+    assert engine.unsupported(dbn, {"reading": [1, 0]}) is None
+
+
+def test_maps_are_integrated_out_where_no_engine_is_named_and_few_states_are_not() -> None:
+    chosen = bmc.explain(ring(64), {"reading": [1, 0, 1]})
+    assert isinstance(chosen.engine, bmc.ParticleFilter) and chosen.engine.marginalize == "auto"
+    assert "'color' integrated out" in chosen.reasons[0]
+    dbn, start = bmc.DynamicBayesNet(), bmc.Normal(0.0, 1.0)
+    dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
+    dbn.add("x", lambda x_prev: bmc.Normal(np.sin(x_prev), 1.0), initial=start)
+    dbn.add("z", lambda z_prev, x: bmc.Normal(np.cos(x) + z_prev, 0.3), initial=start)
+    dbn.add("y", lambda z, x, s: bmc.Normal(z**2 + s, np.exp(x)))
+    chosen = bmc.explain(dbn, {"y": [0.1, 0.2]})
+    assert isinstance(chosen.engine, bmc.ParticleFilter) and chosen.engine.marginalize is None

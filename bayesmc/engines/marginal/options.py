@@ -10,6 +10,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
 from bayesmc.engines.marginal.choices import MOST
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.marginal.tables.step import refuse_seen_in_part
 from bayesmc.engines.marginal.tables.telling import tables_told
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
@@ -20,6 +21,8 @@ NOT_LAGGED = (
     "marginalize= integrates out; smooth without lag=, or give marginalize=None"
 )
 _SEEN = "observed, weights the particles by its predictive density"
+#: joint states of finite nodes up to which plain particles do, in bits
+FEW = 8.0
 #: questions about slices given rows that come after them
 PAST = ("smooth", "fixed-lag")
 #: options that do not go with it
@@ -110,6 +113,11 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         return f"ParticleFilter: {error}"
     if split is None:
         return None
+    if split.tables is not None:
+        try:
+            refuse_seen_in_part(split.tables, problem.series.observed)
+        except UnsupportedError as error:
+            return str(error)
     slices = problem.slices
     sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.waiting]
     if engine.proposal == "optimal":
@@ -142,6 +150,17 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
                 "value of it; name sampled nodes"
             )
     return None
+
+
+def is_worth_it(engine: Any, problem: SeriesProblem) -> bool:
+    """Whether it pays to integrate out where nobody asks for it: numbers do, and finite nodes by the many.
+
+    Plain particles are machine code, and meet all of a few states.
+    """
+    split = split_of_problem(engine, problem)
+    if split is None:
+        return False
+    return bool(split.inner) or (split.tables is not None and split.tables.joint > FEW)
 
 
 def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:

@@ -289,10 +289,13 @@ class MarginalStep(FilterStep):
             if self.tables is not None:
                 layout = self.tables.without(layout)
             guarded = [n for n in layout.seen if n not in full]
-            if guarded:
+            pair = (sorted(late)[0], guarded[0]) if guarded else None
+            if self.tables is not None and pair is None:
+                pair = self.tables.unexplained(full, self.split.seen)
+            if pair is not None:
                 raise UnsupportedError(
-                    f"ParticleFilter(marginalize=...): {sorted(late)[0]!r} is missing in slice {row.t}, and "
-                    f"{guarded[0]!r}, which is sampled, depends on it; start with a row that lacks it, or "
+                    f"ParticleFilter(marginalize=...): {pair[0]!r} is missing in slice {row.t}, and "
+                    f"{pair[1]!r}, which is sampled, depends on it; start with a row that lacks it, or "
                     "give marginalize=None"
                 )
             choices = Choices(layout, full, self.sampling) if self.looks else None

@@ -162,6 +162,11 @@ class TablePlan:
         return frozenset(n for _, n, kind in self.looks if (kind == 0) == is_first)
 
     @property
+    def joint(self) -> float:
+        """Joint states of all nodes that are integrated out, in bits."""
+        return sum(g.elements * math.log2(max(g.states, 1)) for g in self.groups)
+
+    @property
     def largest(self) -> tuple[float, float]:
         """Joint states of the largest table, and those of all."""
         sizes = [float(g.states) for g in self.groups]

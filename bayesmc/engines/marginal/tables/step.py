@@ -21,6 +21,8 @@ from bayesmc.engines.marginal.tables.beliefs import Tables, drawn
 from bayesmc.engines.marginal.tables.groups import GroupStep, Moved, refuse_bad, touched
 from bayesmc.engines.marginal.tables.plan import TablePlan
 from bayesmc.engines.marginal.tables.reading import dependent, particle_rows
+from bayesmc.errors import UnsupportedError
+from bayesmc.network import Observed
 
 
 class Known(NamedTuple):
@@ -98,6 +100,7 @@ class TableFilter:
         ------
         ParameterError
         """
+        refuse_seen_in_part(self.plan, row.seen)
         rows = particle_rows(row, known.values, known.own, known.particles)
         total: Any = 0.0
         logs, moves = [], []
@@ -201,3 +204,19 @@ class TableFilter:
     def _by_apart(self, sums: np.ndarray) -> np.ndarray:
         """Logs of all tables of a particle added, but for plates that are filtered separately."""
         return sums.reshape(len(sums), *self.lead, -1).sum(axis=-1)
+
+
+def refuse_seen_in_part(plan: TablePlan, seen: Mapping[str, Observed]) -> None:
+    """Refuse vectors of which some components are missing, where tables take in their density.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    for name in plan.below:
+        if name in seen and seen[name].parts is not None:
+            nodes = ", ".join(map(repr, sorted(plan.names)))
+            raise UnsupportedError(
+                f"ParticleFilter(marginalize=...): of {name!r} some components are missing, and tables of "
+                f"{nodes} take its vectors in whole; give marginalize=None, or leave all of it out"
+            )
