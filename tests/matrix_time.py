@@ -168,7 +168,7 @@ def tabled(case: Series, seed: int) -> bmc.ParticleFilter | None:
     problem = pose_series(case.dbn, case.observations, case.inputs)
     nodes = [n for n in problem.slices.stochastic if n not in problem.seen]
     rng = np.random.default_rng(seed)
-    for count in (2, 1, 1, 1):
+    for count in (2, 1, 1, 1) if nodes else ():
         names = rng.permutation(nodes)[:count].tolist()
         proposal = "optimal" if seed % 2 else None
         engine = bmc.ParticleFilter(50, marginalize=names, proposal=proposal)
