@@ -155,7 +155,9 @@ def density(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Follo
         return found
     if (name, cut) not in known:
         if isinstance(found, Followed):
-            known[name, cut] = replace(found, cut=cut)
+            # a leaf that has one value in this model may have others where it is cut
+            anew = found.arguments != _arguments(model, _links(model, name), cut)
+            known[name, cut] = _read(model, name, cut) if anew else replace(found, cut=cut)
         else:
             known[name, cut] = Opaque(found.reason, _leaves_above(model, name, cut))
     return known[name, cut]
@@ -315,17 +317,17 @@ def _stored_value(model: Model, name: str, cut: frozenset[str]) -> Expression:
     return gather(constant(order), found.expression)
 
 
-def _read(model: Model, name: str) -> Followed | Opaque:
+def _read(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Followed | Opaque:
     ways = (True, False) if isinstance(_function(model, name), Numbered) else (False,)
     reason = ""
     for for_all_numbers in ways:
         try:
-            found = _shared(model, name, for_all_numbers)
+            found = _shared(model, name, for_all_numbers, cut)
             _check(model, name, found)
             return found
         except TraceError as error:
             reason = str(error)
-    return Opaque(reason, _leaves_above(model, name))
+    return Opaque(reason, _leaves_above(model, name, cut))
 
 
 def _function(model: Model, name: str) -> Any:
@@ -339,7 +341,11 @@ def _leaves_above(model: Model, name: str, cut: frozenset[str] = frozenset()) ->
     return frozenset(p for n in inside for p in model.parents(n)).difference(inside)
 
 
-def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:
+def _links(model: Model, name: str) -> Sequence[tuple[str, Aligner]]:
+    return model[name].links if name in model.nodes else model.potentials[name][1]
+
+
+def _shared(model: Model, name: str, for_all_numbers: bool, cut: frozenset[str]) -> Followed:
     """What is read of a function, which nodes that have it in the same way share."""
     function, table = _function(model, name), None
     if name in model.nodes:
@@ -354,7 +360,7 @@ def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:
         potential, links = model.potentials[name]
         plates = potential.plates
     parents = tuple(parent for parent, _ in links)
-    arguments = _arguments(model, links)
+    arguments = _arguments(model, links, cut)
     what: Hashable
     if table is not None:
         what = table.shape, table.tobytes()
@@ -379,24 +385,29 @@ def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:
     if stochastic != isinstance(reading.result, (Family, Distribution)):
         raise TraceError(f"it returns {type(reading.result).__name__}")
     numbers = (np.asarray(function.number),) if for_all_numbers else ()
-    return Followed(model, reading, parents, arguments, numbers)
+    return Followed(model, reading, parents, arguments, numbers, cut)
 
 
-def _arguments(model: Model, links: Sequence[tuple[str, Aligner]]) -> tuple[Argument, ...]:
+def _arguments(
+    model: Model, links: Sequence[tuple[str, Aligner]], cut: frozenset[str] = frozenset()
+) -> tuple[Argument, ...]:
     first: dict[str, int] = {}
     return tuple(
-        _argument(model, first.setdefault(parent, k), parent, link)
+        _argument(model, first.setdefault(parent, k), parent, link, cut)
         for k, (parent, link) in enumerate(links)
     )
 
 
-def _argument(model: Model, place: int, parent: str, link: Aligner) -> Argument:
+def _argument(
+    model: Model, place: int, parent: str, link: Aligner, cut: frozenset[str]
+) -> Argument:
     node = model[parent]
     domain = node.domain
     known, dtype = None, np.dtype(_dtype(model, node))
     if node.kind == "deterministic" and domain is None:
-        value = value_of(model, parent)
-        known, dtype = value if isinstance(value, Constant) else None, value.dtype
+        value = value_of(model, parent) if parent in cut else value_of(model, parent, cut)
+        is_fixed = isinstance(value, Constant) and parent not in cut
+        known, dtype = value if is_fixed else None, value.dtype
     states = None if domain is None else domain.size
     rows = link.flat.tobytes() if isinstance(link, RowAligner) else None
     how = node.plates, node.event_shape, link.domain is None, domain and domain.key, rows

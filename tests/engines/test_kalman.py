@@ -516,6 +516,32 @@ def test_slice_zero_may_have_another_order() -> None:
         assert off(found.mean(name), [exact.mean(f"{name}[{t}]") for t in range(2)]) < 1e-12
 
 
+@pytest.mark.parametrize("lag", ["constant", "twice removed", "a sequence"])
+def test_what_slice_zero_computes_as_a_constant_is_none_in_later_slices(lag: str) -> None:
+    """A lag that begins at 0, one that is read through a computed node, and a sequence by itself."""
+    dbn = bmc.DynamicBayesNet()
+    if lag == "twice removed":
+        dbn.add("m", lambda l_prev: 2.0 * l_prev, initial=lambda: 0.0)
+    mean = {
+        "constant": lambda x_prev, l_prev: bmc.Normal(1.2 * x_prev - 0.4 * l_prev, 0.7),
+        "twice removed": lambda x_prev, m: bmc.Normal(1.2 * x_prev - 0.2 * m, 0.7),
+        "a sequence": lambda x_prev, l_prev: bmc.Normal(x_prev - l_prev, 0.7),
+    }[lag]
+    dbn.add("x", mean, initial=bmc.Normal(0.0, 1.0))
+    if lag == "a sequence":
+        dbn.add("l", lambda l_prev: 1.0 + 0.5 * l_prev, initial=lambda: 0.0)
+    else:
+        dbn.add("l", lambda x_prev: x_prev, initial=lambda: 0.0)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    rows = {"y": [0.1, 0.9, 1.2, 0.3, -0.5]}
+    exact = bmc.infer(dbn.unroll(5), dbn.unrolled_evidence(rows), engine=bmc.Exact())
+    engines: list[Any] = [KalmanFilter(), bmc.ExtendedKalmanFilter(), bmc.UnscentedKalmanFilter()]
+    for engine in [*engines, bmc.ParticleFilter(3, marginalize="auto")]:
+        found = bmc.filter(dbn, rows, engine=engine)
+        assert off(found.log_marginal_likelihood, exact.log_marginal_likelihood) < 1e-9, engine
+        assert off(found.mean("x")[-1], exact.mean("x[4]")) < 1e-9, engine
+
+
 def test_nothing_hidden_and_nothing_seen() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.add("y", lambda y_prev: bmc.Normal(0.5 * y_prev, 1.0), initial=bmc.Normal(0.0, 1.0))

@@ -235,6 +235,21 @@ def test_what_breaks_linearity_is_sampled_and_said_to_be() -> None:
     assert told(switching(), ROWS, engine)["s"] == "sampled given the slice before and the row"
 
 
+def test_why_nothing_is_integrated_out_is_said_too() -> None:
+    """A nonlinear state that the linear one drives (Schon, Gustafsson and Nordlund 2005)."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "n",
+        lambda n_prev, l_prev: bmc.Normal(np.arctan(n_prev) + l_prev, 0.3),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("l", lambda l_prev: bmc.Normal(0.9 * l_prev, 0.2), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda n: bmc.Normal(0.1 * n**2, 0.3))
+    nodes = told(dbn, {"y": [0.1, 0.2]}, AUTO)
+    assert "'n', which is sampled, depends on it" in nodes["l"]
+    assert "not known to be affine in" in nodes["n"]
+
+
 def test_the_fewest_numbers_are_sampled() -> None:
     """A gain times three numbers: the gain is sampled, and what it follows; a count takes what it reads."""
     dbn = bmc.DynamicBayesNet()
@@ -383,6 +398,21 @@ def test_answers_of_all_kinds_are_near_exact_ones(proposal: str | None) -> None:
     np.testing.assert_allclose(found.cov("x", "s")[-1], rho, atol=0.02)
 
 
+@pytest.mark.parametrize("seen", [[0.4, 0.1, 0.5, 0.7], [0.4, np.nan, 0.5, np.nan]])
+def test_what_could_be_integrated_out_may_be_seen(seen: list[float]) -> None:
+    """In all slices, where Gaussians of no number are left, or in some; by paths of regimes."""
+    rows = {"y": [0.3, 1.2, np.nan, 2.5], "x": seen}
+    logs = []
+    for path in np.ndindex(2, 2, 2, 2):
+        kalman = bmc.filter(switching(), {**rows, "s": list(path)}, engine=bmc.KalmanFilter())
+        logs.append(kalman.log_marginal_likelihood)
+    for proposal in (None, "optimal"):
+        engine = bmc.ParticleFilter(4000, marginalize="auto", proposal=proposal)
+        found = bmc.filter(switching(), rows, engine=engine, rng=0)
+        error = 4 * found.log_marginal_likelihood_mcse + 1e-9
+        assert abs(found.log_marginal_likelihood - np.logaddexp.reduce(logs)) < error
+
+
 def test_trajectories_go_back_through_draws() -> None:
     right = exact(switching(), ROWS)
     engine = bmc.ParticleFilter(1000, marginalize="auto")
@@ -488,8 +518,6 @@ def test_what_does_not_go_together_is_refused_by_name() -> None:
         bmc.ParticleFilter(10, marginalize="auto", compiled=True)
     with pytest.raises(ValueError, match="nothing is named"):
         bmc.ParticleFilter(10, marginalize=[])
-    with pytest.raises(UnsupportedError, match="lag= answers by the ancestors"):
-        bmc.smooth(switching(), ROWS, engine=bmc.ParticleFilter(10, marginalize="auto"), lag=2)
     engine = bmc.ParticleFilter(10, marginalize="auto", proposal="optimal")
     reason = engine.unsupported(volatile(), ROWS)
     assert reason is not None and "'h', which is sampled, is not finite" in reason
@@ -528,4 +556,4 @@ def test_it_is_chosen_where_it_applies() -> None:
     assert "integrated out" in explained.nodes["x"]
     assert "'x' integrated out" in explained.reasons[0]
     lagged = bmc.explain(volatile(), ROWS, question="fixed-lag").engine
-    assert isinstance(lagged, bmc.ParticleFilter) and lagged.marginalize is None
+    assert isinstance(lagged, bmc.ParticleFilter) and lagged.marginalize == "auto"

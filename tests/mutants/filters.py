@@ -357,6 +357,13 @@ MUTANTS = [
         "unbiased_evidence_test, 200 runs of 100 particles",
     ),
     Mutant(
+        "beliefs along smoothed paths are those of the filter",
+        (Edit("bayesmc.engines.marginal.smoothing:_Paths.believed",
+              "combined(messages[k], filtered)", "filtered"),),
+        slices(bmc.smooth, driven, MILD, bmc.ParticleFilter(100, marginalize="auto"), 25),
+        "repeated_test of smooth, 25 runs of 100 particles",
+    ),
+    Mutant(
         "the variance of what is integrated out is that of the particles' means",
         (Edit("bayesmc.engines.particles.blocks:Block._moments",
               "variance += self.weighted(self.turned(inside, self._axes(node)))", "pass"),),

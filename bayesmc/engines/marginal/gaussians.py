@@ -106,8 +106,11 @@ class Gaussians(NamedTuple):
 
     def completed(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
         """Values of all nodes with a belief, one draw for each particle."""
+        return self.values_of(self.drawn(rng) if self.layout.n else self.mean)
+
+    def values_of(self, drawn: np.ndarray) -> dict[str, np.ndarray]:
+        """Draws of all numbers, shape (particles, *lead, n), by node."""
         layout, found = self.layout, {}
-        drawn = self.drawn(rng) if layout.n else self.mean
         for name, place in layout.rows.items():
             found[name] = layout.unpacked(layout.model[name], drawn[..., place])
             found[name].flags.writeable = False
@@ -177,8 +180,8 @@ class Taken(NamedTuple):
         if choice.ndim == 1 and self.group is not None:
             count = self.factors.shape[1]
             pool, which = np.unique(self.group * count + choice, return_inverse=True)
-            every = self.factors.reshape(len(self.factors) * count, *self.factors.shape[2:])
-            factors = every.take(pool, axis=0)
+            groups, _, *own = self.factors.shape
+            factors = self.factors.reshape(groups * count, *own).take(pool, axis=0)
             return Gaussians(self.layout, mean, factors, which)
         every = self.factors if self.group is None else self.factors.take(self.group, axis=0)
         every = np.broadcast_to(every, (n, *every.shape[1:]))

@@ -8,17 +8,20 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
+from bayesmc.engines.filtering import Asked
 from bayesmc.engines.marginal.choices import MOST
+from bayesmc.engines.marginal.smoothing import why_not_backwards
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
 from bayesmc.engines.marginal.tables.step import refuse_seen_in_part
 from bayesmc.engines.marginal.tables.telling import tables_told
+from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
-#: why fixed lags are not answered
+#: why fixed lags are not answered where plates are filtered separately
 NOT_LAGGED = (
-    "ParticleFilter: lag= answers by the ancestors of later particles, and these tell nothing of what "
-    "marginalize= integrates out; smooth without lag=, or give marginalize=None"
+    "ParticleFilter: with marginalize=, lag= does not take plates whose elements are filtered separately; "
+    "smooth without lag=, or give marginalize=None"
 )
 _SEEN = "observed, weights the particles by its predictive density"
 #: joint states of finite nodes up to which plain particles do, in bits
@@ -71,9 +74,7 @@ def split_asked(
     """
     if engine.marginalize is None:
         return None
-    known = frozenset(n for n in slices.stochastic if n in seen)
-    tabled = getattr(engine, "tabled", True) and not getattr(engine, "delay", None)
-    found = split_of(slices, known, engine.marginalize, static, tabled)
+    found = _whole(engine, slices, static, seen)
     return found if found.inner or found.tables is not None else None
 
 
@@ -99,7 +100,8 @@ def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | Non
         split = split_of_problem(without_tables(engine, what), problem)
     except UnsupportedError as error:
         return f"ParticleFilter: {error}"
-    return NOT_LAGGED if what == "fixed-lag" and split is not None else None
+    apart = what == "fixed-lag" and split is not None and plates_apart(problem.slices)
+    return NOT_LAGGED if apart else None
 
 
 def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:
@@ -173,13 +175,35 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
 
 
+def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
+    """Computed nodes that keep trajectories from being drawn backwards: none that is integrated out."""
+    split = split_of_problem(without_tables(engine, PAST[0]), problem)
+    if split is not None and why_not_backwards(problem.slices, split) is None:
+        return ()
+    return endless(problem.slices, problem.seen)
+
+
+def back(engine: Any, problem: SeriesProblem, asked: Asked) -> str:
+    """How smoothing is done, where something is integrated out."""
+    split = split_of_problem(without_tables(engine, asked.what), problem)
+    if split is None or asked.what not in PAST:
+        return ""
+    if asked.what == "fixed-lag":
+        return "a Kalman smoother along the ancestors of each particle"
+    why = why_not_backwards(problem.slices, split)
+    if why is None:
+        return "paths of what is sampled drawn backwards, a Kalman smoother along each"
+    return f"trajectories of all nodes drawn backwards: nothing stays integrated out, as {why}"
+
+
 def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
     """What is done to each node, given what plain particles do to it."""
-    split = split_of_problem(engine, problem)
-    found = dict(treated)
-    if split is None:
+    found, slices = dict(treated), problem.slices
+    if engine.marginalize is None:
         return found
-    slices = problem.slices
+    split = _whole(engine, slices, problem.known_static, problem.seen)
+    if not split.names:
+        return found | {n: f"{found[n]}; not integrated out: {w}" for n, w in split.why.items()}
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
         each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
@@ -207,3 +231,15 @@ def effort_told(engine: Any, problem: SeriesProblem) -> str:
     assert split is not None
     parts = ["a Kalman filter"] * bool(split.inner) + ["tables"] * (split.tables is not None)
     return f"{' and '.join(parts)} for each particle"
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _whole(
+    engine: Any, slices: Slices, static: Mapping[str, np.ndarray], seen: Collection[str]
+) -> Split:
+    """What is integrated out, though it be nothing."""
+    known = frozenset(n for n in slices.stochastic if n in seen)
+    tabled = getattr(engine, "tabled", True) and not getattr(engine, "delay", None)
+    return split_of(slices, known, engine.marginalize, static, tabled)

@@ -226,9 +226,11 @@ class Block:
         np.subtract(rows, mean[..., None], out=off)
         np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
-        inner = self.slices[0].inner
-        if inner is not None and inner.has(node.name):
-            inside = [p.inner.moments_of(node)[1] for p in self.slices]
+        if any(_believed(p, node) for p in self.slices):
+            none = np.zeros((self.particles, *node.value_shape))
+            inside = [
+                p.inner.moments_of(node)[1] if _believed(p, node) else none for p in self.slices
+            ]
             variance += self.weighted(self.turned(inside, self._axes(node)))
         if angles is not None:
             variance = np.where(angles, circular_variance(cosine, sine), variance)
@@ -307,9 +309,14 @@ def diagnosed(slices: Sequence[Figures], lead: tuple[int, ...]) -> dict[str, np.
 
 def _values(particles: Particles, node: CompiledNode) -> np.ndarray:
     """What a mean is taken over: of what is integrated out, every particle's own mean."""
-    if particles.inner is not None and particles.inner.has(node.name):
+    if _believed(particles, node):
         return particles.inner.moments_of(node)[0]
     return particles.values[node.name]
+
+
+def _believed(particles: Particles, node: CompiledNode) -> bool:
+    """Whether particles have beliefs about a node."""
+    return particles.inner is not None and particles.inner.has(node.name)
 
 
 def _unique(particles: Particles, lead: tuple[int, ...]) -> Any:

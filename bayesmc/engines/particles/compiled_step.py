@@ -323,9 +323,14 @@ class _Slice:
     ) -> MadeSlices:
         """Slices from the k-th one on, as many as are of this kind."""
         step, n = self._step, len(earlier.weights)
-        if self._columns is None:
-            self._columns = [self._column(problem, leaf) for leaf in self._kernel.known]
-        most = max(1, min(_TOGETHER, _NUMBERS // (n * self._wide))) if self._goes_on else 1
+        leaves, series = [leaf.name for leaf in self._kernel.known], problem.series
+        agreed = any(
+            p in before and p.removesuffix(PREVIOUS) not in series.observed for p in leaves
+        )
+        if self._columns is None or agreed:
+            self._columns = [self._column(problem, leaf, before) for leaf in self._kernel.known]
+        goes_on = self._goes_on and not agreed
+        most = max(1, min(_TOGETHER, _NUMBERS // (n * self._wide))) if goes_on else 1
         count, store = problem.series.alike(k, most), self._store
         log, weights = (np.ascontiguousarray(a) for a in (earlier.log_weights, earlier.weights))
         cloud = Cloud(before, log, weights, earlier.total, earlier.log_total, earlier.ess)
@@ -366,13 +371,20 @@ class _Slice:
         ]
         return Numbers(np.array(where, np.int64), FADING, KEPT, LEAST)
 
-    def _column(self, problem: SeriesProblem, leaf: Leaf) -> tuple[np.ndarray, int]:
-        """A leaf's values in all slices of a series, and the bytes from one to the next."""
+    def _column(
+        self, problem: SeriesProblem, leaf: Leaf, before: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, int]:
+        """A leaf's values in all slices of a series, and the bytes from one to the next.
+
+        What particles of the slice before agree on, as it was computed there, is that of one slice.
+        """
         series, name = problem.series, leaf.name
         times = series.start + np.arange(series.steps)
         every = {TIME: times, **series.inputs, **{n: o.value for n, o in series.observed.items()}}
         if name in every:
             found = every[name]
+        elif name in before and name.removesuffix(PREVIOUS) not in every:
+            return known_column(leaf, before[name]), 0
         elif name.endswith(PREVIOUS):
             found = every[name.removesuffix(PREVIOUS)]
             found = (

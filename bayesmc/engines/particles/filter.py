@@ -19,7 +19,6 @@ from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
-from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
     BUDGET,
@@ -250,7 +249,7 @@ class ParticleFilter(FilterEngine):
             return NOT_SMOOTHED
         if (why := marginal.not_of_the_past(self, problem, asked.what)) is not None:
             return why
-        sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
+        sums = marginal.endless_sums(self, problem) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
@@ -258,9 +257,9 @@ class ParticleFilter(FilterEngine):
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
-        if self._integrates(problem):
-            return marginal.told(self, problem, found)
-        return found | looks_told(self, problem, found)
+        if not self._integrates(problem):
+            found |= looks_told(self, problem, found)
+        return marginal.told(self, problem, found)
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
@@ -268,7 +267,8 @@ class ParticleFilter(FilterEngine):
         return own or told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
-        return self.effort(problem) if asked.what == "filter" else ""
+        smoothed = marginal.back(self, problem, asked)
+        return self.effort(problem) if asked.what == "filter" else smoothed
 
     def filter(
         self,

@@ -42,6 +42,11 @@ def endless(slices: Slices, seen: Collection[str] = ()) -> tuple[str, ...]:
         found = further
 
 
+def carried_on(slices: Slices, seen: Collection[str] = ()) -> set[str]:
+    """Computed nodes of a slice through which values of the slice before enter the next."""
+    return _carried(slices, {n + PREVIOUS for n in _entering(slices, seen)})
+
+
 def layers_of(plan: SlicePlan, seen: Collection[str]) -> list[Layer]:
     """What slices do to those after them, as far as values are carried on."""
     model, slices = plan.slices.later, plan.slices

@@ -10,6 +10,11 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries
+from bayesmc.engines.marginal.smoothing import (
+    MarginalBackward,
+    lagged_beliefs,
+    why_not_backwards,
+)
 from bayesmc.engines.particles.backward import TRAJECTORIES, Backward, lagged
 from bayesmc.engines.particles.coalescence import Sharing
 from bayesmc.engines.particles.families import Families
@@ -39,7 +44,11 @@ def backwards(
     filtered = filtered_by(engine, step, problem, seed, True, {}, progress)
     assert filtered.held is not None
     count = asked.trajectories or min(step.layout.particles, TRAJECTORIES)
-    backward = Backward(step.plan, step.layout, asked.rejection, problem.seen)
+    backward: Any
+    if step.integrated and why_not_backwards(step.slices, step.split) is None:
+        backward = MarginalBackward(step, asked.rejection)
+    else:
+        backward = Backward(step.plan, step.layout, asked.rejection, problem.seen)
     with quiet():
         rng = stream(seed, Purpose.SMOOTH)
         found = backward.trajectories(filtered.held.particles, problem.series, count, rng)
@@ -60,7 +69,8 @@ def by_lag(
     progress: bool | None,
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """Slices by the particles ``lag`` slices later, through ancestors; and the filter's answer."""
-    step = engine.step_of(problem.slices, problem.known_static)
+    step = engine.step_of(problem.slices, problem.known_static, seen=problem.seen)
+    rng = stream(seed, Purpose.SMOOTH)
     record = Record(problem, step.layout, queries, False)
     window: deque[Particles] = deque(maxlen=lag + 1)
 
@@ -68,7 +78,11 @@ def by_lag(
         window.append(now)
         while window and (len(window) > lag or k == problem.steps - 1):
             at = k - len(window) + 1
-            record.add(at, lagged(list(window), step.layout, step.slices), families=families)
+            if step.integrated:
+                here = lagged_beliefs(step, list(window), problem.series, at, rng)
+            else:
+                here = lagged(list(window), step.layout, step.slices)
+            record.add(at, here, families=families)
             window.popleft()
 
     whole = filtered_by(engine, step, problem, seed, False, {}, progress, look_back=look_back)
