@@ -47,6 +47,8 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
+from bayesmc.engines.approximate.laplace import LaplaceApproximation
+from bayesmc.engines.approximate.posterior_mode import PosteriorMode, map
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
@@ -63,6 +65,7 @@ from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.engines.switching.propagation import ExpectationPropagation
+from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
@@ -116,9 +119,11 @@ __all__ = [
     "KalmanFilter",
     "KernelDensity",
     "Laplace",
+    "LaplaceApproximation",
     "LikelihoodWeighting",
     "LogNormal",
     "Marginal",
+    "MeanField",
     "MetropolisHastings",
     "Mixture",
     "Multinomial",
@@ -132,6 +137,7 @@ __all__ = [
     "PlateArray",
     "Poisson",
     "Posterior",
+    "PosteriorMode",
     "RandomWalk",
     "Recovery",
     "Rejection",
@@ -153,6 +159,7 @@ __all__ = [
     "infer",
     "io",
     "log_density",
+    "map",
     "markov",
     "montecarlo",
     "most_likely",

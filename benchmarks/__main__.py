@@ -9,12 +9,14 @@ from benchmarks import (
     bench_gaussian,
     bench_gibbs,
     bench_marginal,
+    bench_mean_field,
     bench_robot_logs,
     bench_robots,
     bench_scale,
     bench_switching,
     bench_time,
     bench_weighting,
+    prices,
 )
 from benchmarks.harness import data_folder, peer_python
 
@@ -37,6 +39,10 @@ if __name__ == "__main__":
     bench_switching.main()
     print()
     bench_marginal.main()
+    print()
+    prices.main()
+    print()
+    bench_mean_field.main()
     print()
     bench_robots.main(sys.argv[1:])
     print()

@@ -11,7 +11,9 @@ from collections.abc import Sequence
 
 from examples import (
     banana,
+    bee_dance,
     bimodal_mixture,
+    bioassay,
     ceiling_robot,
     central_limit,
     colour_map,
@@ -20,6 +22,7 @@ from examples import (
     diagnosis,
     expectation_and_marginal,
     faithful_gibbs,
+    gnp_trend_cycle,
     growth_benchmark,
     ising_denoising,
     kernels_as_chains,
@@ -32,13 +35,14 @@ from examples import (
     parzen,
     picture,
     pushforward,
+    radar_target,
     range_only,
     rejection_and_importance,
     sonar_localization,
     stochastic_volatility,
-    switching_target,
     three_views,
     van_der_merwe,
+    variational_mixture,
     weight_collapse,
 )
 
@@ -47,8 +51,9 @@ FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
-    banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, coupled_chains, switching_target, colour_map,
+    banana, bioassay, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
+    landmark_localization, range_only, coupled_chains, radar_target, bee_dance, gnp_trend_cycle,
+    variational_mixture, colour_map,
 )  # fmt: skip
 
 

@@ -9,11 +9,12 @@ from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions import Laplace
+from bayesmc.engines.approximate.laplace import LaplaceApproximation
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
-from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
@@ -114,7 +115,7 @@ def explained(
     if type(chosen).__name__ in refused:
         return Explanation(chosen, tuple(reasons), refused)
     nodes, table = chosen.describe(problem), tuple(chosen.table(problem))
-    effort = chosen.effort(problem) if isinstance(chosen, ChainEngine) else ""
+    effort = chosen.effort(problem)
     return Explanation(chosen, tuple(reasons), refused, nodes, table, effort)
 
 
@@ -179,6 +180,10 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
 
 
 def _checked(engine: Any) -> Any:
+    if (
+        isinstance(engine, Laplace) and engine.is_standard
+    ):  # the method has its name from the same man
+        return LaplaceApproximation()
     if isinstance(engine, type):
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"

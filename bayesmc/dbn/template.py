@@ -383,10 +383,10 @@ class DynamicBayesNet:
         if isinstance(initial, (list, tuple, np.ndarray)):
             try:
                 return self._read(name, BayesNet.table, (), initial, states, plates=plates)
-            except ParameterError as error:
+            except (ModelError, ParameterError) as error:
                 error.add_note(
-                    "initial= is the density of slice 0: a list holds the probabilities of a finite node; "
-                    "for others give a distribution, such as Normal(0.0, 1.0)"
+                    "initial= is the density of slice 0: a list holds the probabilities of a finite node "
+                    "that reads no other; for others give a distribution (Normal(0.0, 1.0)) or a function"
                 )
                 raise
         if not isinstance(initial, Distribution) and not callable(initial):

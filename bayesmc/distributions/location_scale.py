@@ -39,6 +39,8 @@ class LocationScale(Distribution):
 class Laplace(LocationScale):
     """Laplace (double exponential) distribution, ``exp(-|x - loc| / scale) / (2 scale)``.
 
+    ``infer(..., engine=bmc.Laplace())`` is another thing of the same name: `LaplaceApproximation`.
+
     Parameters
     ----------
     loc : array_like
@@ -61,6 +63,11 @@ class Laplace(LocationScale):
     >>> float(bmc.Laplace(0.0, 2.0).log_prob(2.0).round(4)), float(bmc.Laplace(0.0, 2.0).var)
     (-2.3863, 8.0)
     """
+
+    @property
+    def is_standard(self) -> bool:
+        """Whether it is one number about 0 of scale 1."""
+        return not self.batch_shape and float(self.loc) == 0.0 and float(self.scale) == 1.0
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.laplace(size=shape))

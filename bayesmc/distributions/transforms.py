@@ -123,6 +123,11 @@ class Transform:
         """Shape of the unconstrained numbers behind one value."""
         return self.event_shape
 
+    @property
+    def angles(self) -> np.ndarray:
+        """Which unconstrained numbers are angles, the same again after a turn; their shape."""
+        return np.zeros(self.unconstrained_shape, bool)
+
     def constrain(self, u: Any) -> np.ndarray:
         """The value at ``u``, shape ``(..., *event_shape)`` from ``(..., *unconstrained_shape)``."""
         with np.errstate(all="ignore"):
@@ -187,6 +192,10 @@ class Wrapped(Transform):
     def formula(self, u: Any) -> Any:
         # an angle already in range keeps all its digits
         return u - 2 * np.pi * np.floor((u + np.pi) / (2 * np.pi))
+
+    @property
+    def angles(self) -> np.ndarray:
+        return np.ones(self.unconstrained_shape, bool)
 
     def _kept_inside(self, x: np.ndarray) -> np.ndarray:
         return np.where(x >= np.pi, -np.pi, np.maximum(x, -np.pi))
@@ -342,6 +351,10 @@ class SideBySide(Transform):
     @property
     def unconstrained_shape(self) -> Shape:
         return (sum(_width(part.unconstrained_shape) for part in self.parts),)
+
+    @property
+    def angles(self) -> np.ndarray:
+        return np.concatenate([np.atleast_1d(part.angles) for part in self.parts])
 
     def formula(self, u: Any) -> Any:
         pieces = self._cut(u, lambda part: part.unconstrained_shape)

@@ -75,6 +75,10 @@ class Engine:
         """What the engine does to each node, in columns; empty where ``describe`` says all."""
         return []
 
+    def effort(self, problem: Problem) -> str:
+        """What an answer takes, or how far it is to be trusted, in words; empty: nothing to say."""
+        return ""
+
     def run(
         self,
         problem: Problem,

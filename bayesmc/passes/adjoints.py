@@ -22,7 +22,7 @@ from bayesmc.expression import (
 )
 from bayesmc.expression.functions import Repeated
 from bayesmc.expression.scatter import Gathered, Places, Scattered
-from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.passes.arithmetic import ZERO, add, multiply
 from bayesmc.shapes import Shape
 
 
@@ -61,6 +61,12 @@ def excluded_products(operand: Expression, axes: Sequence[int]) -> Expression:
 
 def call_tangent(node: Call, moved: Sequence[Expression]) -> Expression:
     """How the result of a call moves when its operands move so."""
+    if isinstance(node.call, Scattered):  # sums of elements move as they do
+        return call(node.call, moved, node.shape, float)
+    if isinstance(node.call, Gathered):
+        return call(node.call, [moved[0], node.operands[1]], node.shape, float)
+    if isinstance(node.call, _Excluded):
+        return _excluded_tangent(node.call, node.operands[0], moved[0])
     rule, places, values = _applied(node)
     total: Expression = ZERO
     for k, direction in zip(places, moved, strict=True):
@@ -77,6 +83,27 @@ def call_adjoints(node: Call, own: Expression) -> list[Expression | None]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _excluded_tangent(made: _Excluded, operand: Expression, moved: Expression) -> Expression:
+    """How products of all but one move: the sum over each of those of the products without both."""
+    axes = tuple(a + len(operand.shape) for a in made.axes)
+    if len(axes) > 1:
+        raise TraceError("no second derivative of np.prod over several axes is known")
+    (axis,), width = axes, operand.shape[axes[0]]
+    parts = []
+    for k in range(width):  # without k, and how the product of the others moves
+        at = [j for j in range(width) if j != k]
+        places = np.arange(operand.size).reshape(operand.shape)
+        others = pick([operand], np.take(places, at, axis=axis))
+        along = pick([moved], np.take(places, at, axis=axis))
+        each = excluded_products(others, [axis])
+        parts.append(reduction(np.add, multiply(each, along), [axis]))
+    size = parts[0].size
+    stacked = np.stack(
+        [k * size + np.arange(size).reshape(parts[0].shape) for k in range(width)], axis
+    )
+    return pick(parts, stacked)
 
 
 @dataclass(frozen=True)

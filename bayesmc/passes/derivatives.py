@@ -215,11 +215,13 @@ def _pushed(node: Expression, moved: list[Expression]) -> Expression:
     """How a value moves when its operands move so."""
     if all(is_all(m, 0) for m in moved):
         return ZERO
+    if isinstance(node, Elementwise) and node.function is np.where:
+        return tidy(np.where, node.operands[0], moved[1], moved[2])  # the other stays out, even NaN
     if isinstance(node, Elementwise):
         total = ZERO
         for slope, own in zip(slopes(node), moved, strict=True):
             if slope is not None and not is_all(own, 0):
-                total = add(total, _times(own, slope, node.function is np.where))
+                total = add(total, multiply(own, slope))
         return total
     full = [broadcast(m, a.shape) for m, a in zip(moved, node.operands, strict=True)]
     if isinstance(node, Pick):

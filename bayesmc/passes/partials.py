@@ -48,6 +48,12 @@ def _chosen(a: Any, b: Any, y: Any) -> Any:
     return _kinked(np.equal(y, a), np.equal(a, b))
 
 
+def _i1e_slope(x: Any, y: Any) -> Any:
+    near = np.less(np.abs(x), 1e-8)
+    share = np.where(near, 0.5, y / np.where(near, 1.0, x))
+    return special.i0e(x) - share - np.sign(x) * y
+
+
 def _both(rule: Partial) -> tuple[Partial, Partial]:
     """Partial derivatives of a function of two arguments that may be exchanged."""
     return rule, lambda a, b, y: rule(b, a, y)
@@ -127,6 +133,7 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
     ),
     special.digamma: (lambda x, y: special.zeta(2.0, x),),
     special.i0e: (lambda x, y: special.i1e(x) - np.sign(x) * y,),
+    special.i1e: (_i1e_slope,),
     special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: np.true_divide(a, b)),
     special.xlog1py: (lambda a, b, y: np.log1p(b), lambda a, b, y: np.true_divide(a, 1.0 + b)),
 }

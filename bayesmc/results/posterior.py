@@ -194,6 +194,13 @@ class Posterior:
         """
         raise self._cannot("to_datatree")
 
+    def check(self, draws: int = 4000, rng: Any = None) -> Any:
+        """Whether a deterministic approximation can be trusted; only posteriors of such engines answer."""
+        raise UnsupportedError(
+            f"check: {type(self).__name__} is no deterministic approximation, whose bias it tells; of draws "
+            "ask mcse, ess, rhat and pareto_k"
+        )
+
     # ---- what a posterior of its own kind knows of a node, by name, or of a query ----------------
 
     def _averaged(self, query: Query) -> np.ndarray:

@@ -10,8 +10,10 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import Expression, Program
+from bayesmc.passes.arithmetic import ZERO
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.structure.free_nodes import FreeNode
+from bayesmc.structure.summing import Summed
 from bayesmc.structure.target import Target, Values
 
 #: the leaf of all free numbers
@@ -35,6 +37,10 @@ class UnconstrainedDensity:
         Its derivatives by the free numbers.
     summed : tuple of str
         Finite nodes that are summed out.
+    volume : Expression
+        The logarithm of the change of volume, which is part of ``root``.
+    tables : tuple of Summed
+        What they are summed out of, in terms of the same leaves.
     """
 
     target: Target = field(repr=False)
@@ -42,6 +48,8 @@ class UnconstrainedDensity:
     root: Expression = field(repr=False)
     slopes: Expression = field(repr=False)
     summed: tuple[str, ...] = ()
+    volume: Expression = field(default=ZERO, repr=False)
+    tables: tuple[Summed, ...] = field(default=(), repr=False)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -61,6 +69,11 @@ class UnconstrainedDensity:
     def labels(self) -> list[str]:
         """A name for every free number: ``sd[2]``."""
         return [label for node in self.nodes for label in node.labels]
+
+    @cached_property
+    def angles(self) -> np.ndarray:
+        """Which free numbers are angles, shape (size,)."""
+        return np.concatenate([np.zeros(0, bool), *(node.angles for node in self.nodes)])
 
     def value(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None = None) -> np.ndarray:
         """The log density, shape the batch; minus infinity where it is zero or no number.

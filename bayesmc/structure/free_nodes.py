@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.support import Support
-from bayesmc.distributions.transforms import Bounded, Transform, transform_of
+from bayesmc.distributions.transforms import Bounded, Identity, Transform, Wrapped, transform_of
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import (
     Constant,
@@ -93,6 +93,18 @@ class FreeNode:
             f"{self.name}[{', '.join(map(str, (*p, *i)))}]" if (p or i) else self.name
             for p, i in itertools.product(places, inner)
         ]
+
+    @property
+    def angles(self) -> np.ndarray:
+        """Which of its free numbers are angles, the same again after a turn, shape (size,)."""
+        own = self.own_shape
+        each = np.zeros(own, bool) if self.transform is None else self.transform.angles
+        return np.broadcast_to(each.ravel(), (math.prod(self.lead), math.prod(own))).ravel()
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether its free numbers stand for values with bounds."""
+        return not isinstance(self.transform, (Identity, Wrapped))
 
     def expressions(
         self, part: Expression, above: Mapping[str, Expression]

@@ -13,6 +13,7 @@ Derivatives, 2nd ed., sec. 3.2.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import (
     Expression,
     Leaf,
+    as_expression,
     broadcast,
     leaf,
     pick,
@@ -27,7 +29,7 @@ from bayesmc.expression import (
 )
 from bayesmc.expression.graph import substituted
 from bayesmc.passes.alike import sums_of
-from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.passes.arithmetic import ZERO, add, multiply
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.guarded import guarded
 from bayesmc.passes.logarithms import stable
@@ -106,16 +108,37 @@ def unconstrained_density(
         )
     once = _on_one_leaf(nodes, parts)
     slopes = _slopes(root, list(zip(terms, used, strict=False)), list(parts.values()), once)
-    density = UnconstrainedDensity(target, nodes, once(root), slopes, tuple(finite))
+    tables = [table.mapped(lambda e: once(guarded([e])[0])) for table in tables]
+    volume = once(_total(used[len(terms) :]))
+    density = UnconstrainedDensity(
+        target, nodes, once(root), slopes, tuple(finite), volume, tuple(tables)
+    )
     plain = [once(e) for e in guarded([*plain, *volumes.values()])]
     hold_against_model(
         density,
         terms,
         plain,
         [once(e) for e in guarded(used)],
-        [table.mapped(lambda e: once(guarded([e])[0])) for table in tables],
+        tables,
     )
     return density
+
+
+def without_volume(density: UnconstrainedDensity) -> UnconstrainedDensity:
+    """The same log density by the nodes' own coordinates, still as a function of free numbers.
+
+    Where it is largest is the mode that is meant without mention of any map.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    root = add(density.root, multiply(as_expression(-1.0), density.volume))
+    try:
+        slopes = stable([gradient(root, [FREE])[FREE]])[0]
+    except TraceError as error:
+        raise UnsupportedError(str(error)) from error
+    return replace(density, root=root, slopes=slopes, volume=ZERO)
 
 
 # ---- private ------------------------------------------------------------------------------------

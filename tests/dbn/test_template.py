@@ -283,6 +283,7 @@ def test_faults_name_the_node_and_the_remedy(fault: str) -> None:
     ("initial", "error", "message"),
     [
         (np.array([1.0, 1.0, 0.0]), ParameterError, "the probabilities of a finite node"),
+        (np.array([[0.5, 0.5], [0.2, 0.8]]), ModelError, "that reads no other; for others give"),
         ({"mean": 0.0}, ModelError, "initial= is of type dict; give the density of slice 0"),
     ],
 )

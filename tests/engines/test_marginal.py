@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines.marginal.reading import SliceReader
 from bayesmc.errors import (
     BudgetError,
     DegeneracyError,
@@ -557,3 +558,26 @@ def test_it_is_chosen_where_it_applies() -> None:
     assert "'x' integrated out" in explained.reasons[0]
     lagged = bmc.explain(volatile(), ROWS, question="fixed-lag").engine
     assert isinstance(lagged, bmc.ParticleFilter) and lagged.marginalize == "auto"
+
+
+def test_coefficients_of_a_mode_are_read_once_whatever_other_modes_are_about(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Six modes: sets of those that particles have are many, and go on changing."""
+    read: list[int] = []
+
+    def counted(self: Any, values: Any, kinds: int, choices: int) -> Any:
+        read.append(kinds)
+        return reads(self, values, kinds, choices)
+
+    reads = SliceReader.read_choices
+    monkeypatch.setattr(SliceReader, "read_choices", counted)
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("s", ["s_prev"], np.full((6, 6), 0.04) + 0.76 * np.eye(6), initial=np.full(6, 1 / 6))
+    dbn.add("x", lambda x_prev, s: bmc.Normal(0.9 * x_prev + s, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    engine = bmc.ParticleFilter(10, marginalize="auto", proposal="optimal")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LowEssWarning)
+        bmc.filter(dbn, {"y": np.linspace(0.0, 30.0, 60) % 9.0}, engine=engine, rng=0)
+    assert sum(read) <= 2 * (1 + 6)  # of slice 0 and each mode before, for particles and for scouts

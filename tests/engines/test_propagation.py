@@ -411,3 +411,20 @@ def test_nothing_is_said_where_messages_settle() -> None:
         warnings.simplefilter("error")
         found = bmc.smooth(jumping(), {"y": [0.1, 3.0, 2.5]}, engine=EP)
     assert found.converged is True and found.change <= 1e-5 and found.skipped == 0
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_readings_without_noise_tell_numbers_of_a_mode(noise: float) -> None:
+    """Nothing is left to merge but what rounding leaves of means that are equal; 0.3: in one mode only."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("s", ["s_prev"], [[0.8, 0.2], [0.3, 0.7]], initial=[0.5, 0.5])
+    dbn.add("x", lambda x_prev, s: bmc.Normal(x_prev + s, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x, s: bmc.Normal(x + s, np.array([0.0, noise])[s]))
+    rows = {"y": [0.1, 1.2, 2.0, 0.3, -0.2]}
+    found = bmc.smooth(dbn, rows, engine=EP)
+    right = bmc.infer(dbn.unroll(5), dbn.unrolled_evidence(rows), engine=bmc.Exact())
+    assert found.converged
+    assert abs(found.log_marginal_likelihood - right.log_marginal_likelihood) < 1e-3
+    for t in range(5):
+        assert abs(found.mean("x")[t] - right.mean(f"x[{t}]")) < 1e-3
+        assert off(found.probabilities("s")[t], right.probabilities(f"s[{t}]")) < 1e-3

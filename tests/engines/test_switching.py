@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc import SwitchingKalmanFilter
+from bayesmc import ExpectationPropagation, SwitchingKalmanFilter
 from bayesmc.engines.switching import run
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError, ZeroProbabilityError
 from bayesmc.lowering import is_available
@@ -154,6 +154,92 @@ def test_vague_starts_lose_no_digits() -> None:
     for name in ("x", "v"):
         assert off(one.mean(name), two.mean(name)) < 1e-8
         assert off(one.var(name), two.var(name)) < 1e-8
+
+
+def seen_by_bearing(turn: float, family: Any) -> tuple[bmc.DynamicBayesNet, dict[str, Any]]:
+    """A target that a radar sees, all of it turned about the radar; and rows that are turned, too."""
+    rows = {
+        "range": [10.1, 9.2, 8.3, 7.9, 7.1, 6.4],
+        "bearing": [0.06, 0.09, 0.22, 0.3, 0.35, 0.54],
+    }
+    c, s = np.cos(turn), np.sin(turn)
+    about = np.kron(np.eye(2), [[c, -s], [s, c]])
+    move = np.eye(4) + np.eye(4, k=2)
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
+    start = bmc.MvNormal(about @ [10.0, 1.0, -1.0, 0.3], 0.3 * np.eye(4))
+    dbn.add(
+        "x",
+        lambda x_prev, s: bmc.MvNormal(
+            np.matvec(move, x_prev), np.where((s == 1)[..., None, None], 0.3, 0.01) * np.eye(4)
+        ),
+        initial=start,
+    )
+    dbn.add("range", lambda x: bmc.Normal(np.hypot(x[..., 0], x[..., 1]), 0.1))
+    dbn.add("bearing", lambda x: family(np.arctan2(x[..., 1], x[..., 0]), 0.05))
+    rows["bearing"] = (np.array(rows["bearing"]) + turn + np.pi) % (2 * np.pi) - np.pi
+    return dbn, rows
+
+
+@pytest.mark.parametrize(
+    "engine", [SwitchingKalmanFilter(linearize=True), ExpectationPropagation(linearize=True)]
+)
+def test_readings_on_a_circle_say_the_same_whatever_north_is(engine: Any) -> None:
+    """Of Normal ones they do not, where they cross the cut: such a mix-up would show."""
+    found = {}
+    for family in (bmc.WrappedNormal, bmc.Normal):
+        for turn in (0.0, np.pi - 0.2):
+            dbn, rows = seen_by_bearing(turn, family)
+            belief = bmc.smooth(dbn, rows, engine=engine)
+            found[family, turn] = np.array([
+                belief.log_marginal_likelihood, *belief.probabilities("s")[:, 1],
+                *np.hypot(*belief.mean("x")[:, :2].T),
+            ])  # fmt: skip
+    for family in (bmc.WrappedNormal, bmc.Normal):
+        same = off(found[family, np.pi - 0.2], found[family, 0.0]) < 1e-8
+        assert same == (family is bmc.WrappedNormal)
+    assert off(found[bmc.WrappedNormal, 0.0], found[bmc.Normal, 0.0]) < 1e-8
+    belief = engine.start(dbn := seen_by_bearing(3.0, bmc.WrappedNormal)[0])
+    rows = seen_by_bearing(3.0, bmc.WrappedNormal)[1]
+    for k in range(6):
+        belief = engine.step(belief, {name: values[k] for name, values in rows.items()})
+    whole = bmc.filter(dbn, rows, engine=engine).log_marginal_likelihood
+    assert abs(belief.log_marginal_likelihood - whole) < 1e-9
+    rows["bearing"][3] = np.nan  # of which there would be Gaussians to merge
+    with pytest.raises(UnsupportedError, match="'bearing' is an angle that is not seen in every"):
+        bmc.filter(dbn, rows, engine=engine)
+
+
+@pytest.mark.parametrize("merging", RULES)
+def test_pairs_of_modes_that_cannot_be_need_no_numbers(merging: str) -> None:
+    """Of numbers in a mode that cannot be before nothing is known; a reading divides by the distance."""
+
+    def target(modes: bool) -> bmc.DynamicBayesNet:
+        dbn = bmc.DynamicBayesNet()
+        follow = [[0.8, 0.2], [0.3, 0.7]]
+        start = bmc.MvNormal([3.0, 4.0], 0.1 * np.eye(2))
+        if modes:
+            dbn.table("s", ["s_prev"], follow, initial=[1.0, 0.0])
+            dbn.add(
+                "x", lambda x_prev, s: bmc.MvNormal(x_prev + s[..., None], np.eye(2)), initial=start
+            )
+        else:
+            dbn.input("s")
+            dbn.add("x", lambda x_prev, s: bmc.MvNormal(x_prev + s, np.eye(2)), initial=start)
+        dbn.add("y", lambda x: bmc.Normal(x[..., 0] / np.hypot(x[..., 0], x[..., 1]), 0.2))
+        return dbn
+
+    rows = {"y": [0.6, 0.7]}
+    found = bmc.filter(target(True), rows, engine=SwitchingKalmanFilter(merging, linearize=True))
+    logs = [
+        bmc.filter(
+            target(False), rows, inputs={"s": [0.0, s]}, engine=bmc.ExtendedKalmanFilter()
+        ).log_marginal_likelihood
+        for s in (0.0, 1.0)
+    ]
+    total = np.logaddexp(np.log(0.8) + logs[0], np.log(0.2) + logs[1])
+    assert abs(found.log_marginal_likelihood - total) < 1e-9
+    assert abs(found.probabilities("s")[1, 1] - np.exp(np.log(0.2) + logs[1] - total)) < 1e-9
 
 
 # ---- published and independent figures ----------------------------------------------------------

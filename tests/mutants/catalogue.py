@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from tests.mutants import (
+    approximate,
     chains,
     densities,
     draws,
@@ -13,16 +14,19 @@ from tests.mutants import (
     slices,
     switching,
     tables,
+    variational,
 )
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
+    *approximate.MUTANTS,
     *chains.MUTANTS,
     *draws.MUTANTS,
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
     *tables.MUTANTS,
+    *variational.MUTANTS,
     *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *slices.MUTANTS,

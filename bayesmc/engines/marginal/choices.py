@@ -20,15 +20,15 @@ from bayesmc.dbn import Row
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.gaussians import Coefficients
-from bayesmc.engines.marginal.reading import SliceReader, Values
+from bayesmc.engines.marginal.reading import Kinds, SliceReader, Values
 from bayesmc.engines.particles.smc import along_plates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import UnsupportedError
 from bayesmc.network.forward import summed
 from bayesmc.structure.tables import configurations
 
-#: sets of kinds whose coefficients are kept
-_KEPT = 64
+#: kinds whose coefficients are kept
+_KEPT = 1024
 #: joint states of the finite nodes of a slice above which it refuses
 MOST = 256
 
@@ -80,7 +80,8 @@ class Choices:
             )
         found, sizes = configurations([], nodes, layout.apart)
         self.count = int(np.prod(sizes))
-        self._kept: dict[bytes, tuple[np.ndarray, Linear]] = {}
+        self._kept: dict[tuple[tuple[str, ...], int], int] = {}
+        self._made: list[np.ndarray] = []
         self.values = {
             n.name: np.broadcast_to(v, (*sizes, *n.plate_shape)).reshape(-1, *n.plate_shape)
             for n, v in zip(nodes, found, strict=True)
@@ -97,17 +98,13 @@ class Choices:
         if kinds is None:
             log, made = self._worked_out(values, None, row, reader)
             return log, Coefficients(*made, None)
-        key = kinds.codes.tobytes()
-        found = None if self._changes(values, row, reader) else self._kept.get(key)
-        if found is None:
-            found = self._worked_out(values, kinds.of_kind, row, reader)
-            if len(self._kept) >= _KEPT:
-                self._kept.clear()
-            self._kept[key] = found
-        log, (offset, moves, noise) = found
-        kind = kinds.kind
-        offset = offset.take(kind, axis=0)
-        return log.take(kind, axis=0), Coefficients(offset, moves, noise, kind)
+        if self._changes(values, row, reader):
+            log, made = self._worked_out(values, kinds.of_kind, row, reader)
+            kind = kinds.kind
+        else:
+            log, made, kind = self._remembered(values, kinds, row, reader)
+        offset = made.offset.take(kind, axis=0)
+        return log.take(kind, axis=0), Coefficients(offset, made.moves, made.noise, kind)
 
     def drawn(self, log: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """The logs' sums over choices, and one choice for each particle by them, shape (particles, *lead)."""
@@ -137,6 +134,25 @@ class Choices:
         """Whether anything is read, or seen of a node with a value, that other slices have otherwise."""
         seen = any(name in row.seen for name in self.layout.certain)
         return seen or reader.changing(values, reader.needed)
+
+    def _remembered(
+        self, values: Values, kinds: Kinds, row: Row, reader: SliceReader
+    ) -> tuple[np.ndarray, Linear, np.ndarray]:
+        """Log densities and coefficients of all kinds so far, and which each particle has."""
+        names = tuple(sorted(values.own))
+        keys = [(names, code) for code in kinds.codes.tolist()]
+        if len(self._kept.keys() | keys) > _KEPT:
+            self._kept, self._made = {}, []
+        new = [k for k, key in enumerate(keys) if key not in self._kept]
+        if new:
+            log, made = self._worked_out(values, kinds.of_kind[new], row, reader)
+            for k in new:
+                self._kept[keys[k]] = len(self._kept)
+            old = self._made or [part[:0] for part in (log, *made)]
+            self._made = [np.concatenate(p) for p in zip(old, (log, *made), strict=True)]
+        place = np.array([self._kept[key] for key in keys], dtype=np.intp)
+        log, *parts = self._made
+        return log, Linear(*parts), place.take(kinds.kind)
 
     def _worked_out(
         self, values: Values, which: np.ndarray | None, row: Row, reader: SliceReader

@@ -258,9 +258,10 @@ def _is_count(most: object) -> bool:
 
 
 def _why_not_linearized(layout: Layout) -> str | None:
-    angular = next((n for n in layout.placed if layout.angles_of(n).any()), None)
+    angular = next((n for n in layout.rows if layout.angles_of(n).any()), None)
     if angular is None:
         return why_not_matched(layout)
     return why_not_matched(layout) or (
-        f"node {angular!r} is an angle, and Gaussians of several modes are merged on a line"
+        f"node {angular!r} is an angle that is not seen in every row, and Gaussians of several modes are "
+        "merged on a line"
     )

@@ -43,7 +43,9 @@ class SwitchingKalmanFilter(SwitchingEngine):
         too). ``"gpb1"``: one Gaussian, merged over all modes, is taken on.
     linearize : bool
         Makes functions that are not affine linear at each mode's mean by their derivatives, as
-        ``ExtendedKalmanFilter`` does; otherwise templates with such are refused.
+        ``ExtendedKalmanFilter`` does; otherwise templates with such are refused. Readings that are angles
+        (``WrappedNormal``, ``VonMises``) count the short way round; hidden angles are refused, and readings
+        that are missing in some row.
     max_modes : int
         Modes above which it refuses.
 

@@ -14,6 +14,9 @@ import numpy as np
 from bayesmc.linalg.square_root import condition_many
 from bayesmc.lowering import GaussianLoops
 
+#: share of a mean that rounding leaves where Gaussians of the same mean are merged
+_ROUNDED = 8 * float(np.finfo(float).eps)
+
 
 class Mixture(NamedTuple):
     """Gaussians with weights, along the first axis.
@@ -63,6 +66,15 @@ def shares(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.where(none, -np.inf, np.log(total) + top), parts / np.where(none, 1.0, total)[
             :, None
         ]
+
+
+def without_rounding(found: Mixture) -> Mixture:
+    """Deviations that are only what rounding leaves of equal means are none."""
+    size = np.sqrt(np.vecdot(found.factor, found.factor))
+    short = size <= _ROUNDED * np.abs(found.mean)
+    if not short.any():
+        return found
+    return found._replace(factor=np.where(short[..., None], 0.0, found.factor))
 
 
 def merged(

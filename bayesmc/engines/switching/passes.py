@@ -129,7 +129,10 @@ def _taken(
     expected, rows, terms = place.stretch.expected(place.at, pattern, by_kind, mean, factor)
     p = len(pattern.observed)
     made = condition(rows, p, layout.n_prev) if turning else condition_many(rows, p)
-    if pattern.absent is None and made.certain is None:
+    angles = layout.angles
+    if angles is not None:
+        angles = angles[pattern.observed]
+    if pattern.absent is None and made.certain is None and angles is None:
         off = place.row - expected[..., :p]
         eta = (
             off / made.root[..., 0]
@@ -138,7 +141,9 @@ def _taken(
         )
         after = expected[..., p:] + np.matvec(made.gain, eta)
         return Taken(after, made.factor, log_densities(made.root, eta), made, eta)
-    after, eta, log = absorbed(layout, pattern, made, expected, place.row, place.given, terms=terms)
+    after, eta, log = absorbed(
+        layout, pattern, made, expected, place.row, place.given, angles, terms
+    )
     after = after[..., pattern.kept - layout.p]
     wide = np.broadcast_to(made.factor, (*after.shape, after.shape[-1]))
     return Taken(after, wide, log, made, eta)

@@ -12,7 +12,7 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Asked, Queries, quiet
 from bayesmc.engines.switching.engine import SwitchingEngine
-from bayesmc.engines.switching.merging import Mixture
+from bayesmc.engines.switching.merging import Mixture, without_rounding
 from bayesmc.engines.switching.posterior import SwitchingSeries
 from bayesmc.engines.switching.run import SwitchingRun
 from bayesmc.engines.switching.slice_factors import Scale, SliceFactor
@@ -201,7 +201,7 @@ class _Messages:
     """Between the slices of a series."""
 
     def __init__(self, run: SwitchingRun, filtered: list[Mixture]) -> None:
-        self.filtered = run.completed(filtered)
+        self.filtered = [without_rounding(found) for found in run.completed(filtered)]
         backs = run.turned(self.filtered)
         self.scales = [Scale.of(found) for found in run.noise(self.filtered, backs)]
         for k, scale in enumerate(self.scales):

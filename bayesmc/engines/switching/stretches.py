@@ -333,14 +333,22 @@ class Stretch:
     @cached_property
     def _needed(self) -> np.ndarray:
         """Which kinds can be in which slice, shape (time, kinds)."""
+        found = np.zeros((self.count, len(self.pairs.of_kind)), dtype=bool)
+        for kinds, pairs in zip(found, self._possible, strict=True):
+            np.logical_or.at(kinds, self.pairs.kind, pairs)
+        return found
+
+    @cached_property
+    def _possible(self) -> np.ndarray:
+        """Which pairs can be in which slice, shape (time, pairs)."""
         pairs = self.pairs
-        found = np.zeros((self.count, len(pairs.of_kind)), dtype=bool)
+        found = np.zeros((self.count, len(pairs.dst)), dtype=bool)
         count = max(len(pairs.before), 1)
         reached = self._all_before(count) if self._reached is None else self._reached
         src = pairs.src if len(pairs.before) else np.zeros(len(pairs.dst), dtype=np.intp)
         for k in range(self.count):
             can = (self.log_of(k) > -np.inf) & reached[src]
-            np.logical_or.at(found[k], pairs.kind, can.reshape(len(can), -1).any(axis=1))
+            found[k] = can.reshape(len(can), -1).any(axis=1)
             if (
                 len(pairs.now) == count
             ):  # later slices go from the modes of one to the same of the next
@@ -388,8 +396,8 @@ class Stretch:
             try:
                 found.append(expected_slice(ahead, self.rule, plan))
             except ParameterError:
-                needed = self._needed[k]
-                if needed[self.pairs.kind[pair]] or not needed.any():
+                needed = self._needed[k] if by_kind else self._possible[k]
+                if needed[unit] or not needed.any():
                     raise
                 found.append(None)
         some = next(p for p in found if p is not None)

@@ -1,0 +1,291 @@
+"""``posterior.check``: an approximation held against the model by importance sampling.
+
+Draws of the approximation q are weighed by p/q, with p the model's own functions (not what an engine read of
+them, so that faults of reading show, too). The largest weights are replaced by quantiles of a generalised
+Pareto distribution that is fitted to them, whose shape k says whether averages of the weights can be trusted.
+Corrected answers come from draws with heavier tails, where the approximation has some: what lies beyond the
+tails of q none of its own draws has met, and their weights cannot tell.
+
+References
+----------
+Vehtari, Simpson, Gelman, Yao and Gabry (2024), Pareto smoothed importance sampling, JMLR 25, algorithm 1 and
+sec. 3.3; Yao, Vehtari, Simpson and Gelman (2018), Yes, but did it work?: Evaluating variational inference,
+ICML, sec. 3.1.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesmc.categorical import log_sum_exp
+from bayesmc.diagnostics import MAX_PARETO_K, pareto_k
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.approximate.approximation import Approximation, Drawn
+from bayesmc.engines.approximate.evidence import log_constants
+from bayesmc.engines.approximate.stored import as_stored, completed
+from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.network import Problem
+from bayesmc.results import DrawsPosterior, Posterior
+from bayesmc.structure.target import target_of
+
+#: draws of which a tail can be told at all
+_FEWEST = 25
+#: differences of log weights that are rounding
+_EQUAL = 1e-7
+#: rows of the summary
+_ROWS = 12
+
+
+class CheckedPosterior(DrawsPosterior):
+    """Draws of an approximation, weighed so that they answer for the posterior."""
+
+    k: float = np.nan
+
+    @property
+    def pareto_k(self) -> float | None:  # type: ignore[override]
+        """Tail shape of the weights as they were before their tail was smoothed."""
+        return self.k
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What ``posterior.check`` found; it prints as a summary.
+
+    Attributes
+    ----------
+    k : float
+        Shape of the tail of the weights p/q, or of those of draws with heavier tails (whichever is larger):
+        below 0.5 good, above ``bound`` not to be trusted. Minus infinity where all weights are equal: the
+        approximation is exact.
+    bound : float
+        The largest k at which as many draws can be trusted, 0.7 of some 2,200 draws or more.
+    ok : bool
+        Whether ``k`` is below it.
+    posterior : Posterior
+        Corrected answers: the draws with smoothed weights, and Monte Carlo errors that count these.
+    log_marginal_likelihood, log_marginal_likelihood_mcse : float
+        The corrected log evidence, and its error.
+    approximate, approximation : Posterior, Approximation
+        What was checked.
+    draws : int
+    """
+
+    k: float
+    bound: float
+    posterior: CheckedPosterior
+    approximate: Posterior = field(repr=False)
+    approximation: Approximation = field(repr=False)
+    draws: int
+
+    @property
+    def ok(self) -> bool:
+        return bool(self.k < self.bound)
+
+    @property
+    def log_marginal_likelihood(self) -> float:
+        assert self.posterior.log_marginal_likelihood is not None
+        return self.posterior.log_marginal_likelihood
+
+    @property
+    def log_marginal_likelihood_mcse(self) -> float:
+        assert self.posterior.log_marginal_likelihood_mcse is not None
+        return self.posterior.log_marginal_likelihood_mcse
+
+    def __str__(self) -> str:
+        own, ess = self.posterior.k, self.posterior.weight_ess
+        plain_words = (
+            "near" if self.k < min(0.5, self.bound) else "off" if self.ok else "not to be trusted"
+        )
+        words = "right within their errors"
+        if not own < self.bound:
+            words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
+        elif not self.ok:
+            words += ", if nothing lies where no draw went"
+        lines = [
+            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
+            f"own coordinates (made in {self.approximation.coordinates})",
+            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {plain_words}",
+            f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
+        ]
+        plain = self.approximate.log_marginal_likelihood
+        if plain is not None:
+            lines.append(
+                f"log evidence {plain:.4f}, corrected {self.log_marginal_likelihood:.4f} "
+                f"+- {self.log_marginal_likelihood_mcse:.4f}"
+            )
+        return "\n".join([*lines, *self._moved()])
+
+    @cached_property
+    def _unweighted(self) -> DrawsPosterior:
+        own = self.posterior
+        return DrawsPosterior(
+            own._live("check"), own.engine, own._stored, own._shape, independent=True
+        )
+
+    def _moved(self) -> list[str]:
+        """The scalars whose means moved most, in standard deviations."""
+        rows = []
+        for name in self.posterior.names:
+            node = self.posterior.model[name]
+            if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
+                continue
+            # of what draws answer the same draws without weights: what moves is no chance
+            closed = self.approximation.marginal(name) is not None
+            before_weights = self.approximate if closed else self._unweighted
+            plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
+            before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
+            error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
+            with np.errstate(all="ignore"):
+                moved = np.where(after > 0, (found - plain) / after, 0.0)
+            labels = self.posterior._row_names(node)
+            rows += list(zip(labels, plain, found, error, before, after, moved, strict=True))
+        rows.sort(key=lambda row: -abs(row[-1]) if np.isfinite(row[-1]) else -np.inf)
+        if not rows:
+            return []
+        width = max(len(row[0]) for row in rows[:_ROWS])
+        lines = [
+            f"{'':{width}}  {'mean':>10} {'corrected':>10} {'mcse':>9} {'sd':>10} {'corrected':>10}"
+            f" {'moved/sd':>9}"
+        ]
+        lines += [
+            f"{n:{width}}  {a:10.4g} {b:10.4g} {e:9.2g} {c:10.4g} {d:10.4g} {m:9.2f}"
+            for n, a, b, e, c, d, m in rows[:_ROWS]
+        ]
+        if len(rows) > _ROWS:
+            lines.append(f"... and {len(rows) - _ROWS} that moved less")
+        return lines
+
+
+def checked(
+    posterior: Posterior, approximation: Approximation, draws: int, rng: np.random.Generator
+) -> Check:
+    """See ``ApproximatePosterior.check``."""
+    if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < _FEWEST:
+        raise ValueError(
+            f"check(draws={draws!r}): draws is a whole number, {_FEWEST} or more, such as 4000"
+        )
+    own = _weighed(posterior, approximation, approximation.draw(rng, int(draws)), rng)
+    spread, found = getattr(approximation, "spread", None), own
+    if spread is not None and own.k > -np.inf:
+        found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
+    k = max(
+        own.k, found.k
+    )  # mass that the approximation's own draws never meet shows in wider ones
+    result = Check(k, _bound(int(draws)), found, posterior, approximation, int(draws))
+    if not result.ok:
+        warnings.warn(_doubt(result), LowEssWarning, stacklevel=3)
+    return result
+
+
+def log_joint(problem: Problem, names: Any, values: Any, draws: int) -> np.ndarray:
+    """The model's log density of the evidence and of nodes' values, what is drawn forward left out.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The nodes of the approximation.
+    values : dict
+        Stored values of all nodes, shape ``(draws, *plates, *event)``.
+
+    Returns
+    -------
+    ndarray, shape (draws,)
+    """
+    target = target_of(problem, names)
+    outside = set(target.chain) - set(names)
+    if outside:
+        raise UnsupportedError(
+            f"check: the approximation says nothing of node {min(outside)!r}, on which something observed "
+            "depends"
+        )
+    with marking_invalid(), np.errstate(all="ignore"):
+        found = np.broadcast_to(target.log_density(values), (draws,))
+    return found + log_constants(target)
+
+
+def pareto_smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
+    """Log weights with their largest replaced by quantiles of a generalised Pareto law, and its shape k.
+
+    Weights that are equal to rounding are left as they are, with k minus infinity.
+    """
+    from arviz_stats.base import array_stats
+
+    possible = log_weights > -np.inf
+    low, top = log_weights[possible].min(), log_weights[possible].max()
+    if possible.all() and top - low < _EQUAL:
+        return log_weights.copy(), -np.inf
+    k = pareto_k(log_weights[possible], log_weights.size)
+    bottom = max(low, top - 600.0)  # what is farther below is nothing, and stays so
+    filled = np.where(possible, np.maximum(log_weights, bottom), bottom - 50.0)
+    try:
+        with np.errstate(all="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            found = np.asarray(array_stats.psislw(-filled)[0])
+    except ValueError:  # there is no tail: its weights are equal
+        return log_weights.copy(), k
+    at = int(filled.argmin())
+    found = found + (filled[at] - found[at])  # as they were before they were made to sum to 1
+    if not np.isfinite(found).all():
+        return log_weights.copy(), k
+    return np.where(possible, found, -np.inf), k
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _weighed(
+    posterior: Posterior, approximation: Approximation, drawn: Drawn, rng: np.random.Generator
+) -> CheckedPosterior:
+    """Draws with the model's density over their own as weights."""
+    problem, draws = posterior._live("check"), len(drawn.log_density)
+    values = completed(problem, approximation.names, drawn, rng)
+    log_target = log_joint(problem, approximation.names, values, draws)
+    with np.errstate(invalid="ignore"):
+        raw = log_target - drawn.log_density
+    raw = np.where(np.isnan(raw), -np.inf, raw)
+    if not (raw > -np.inf).any():
+        raise ZeroProbabilityError(
+            f"check: the model gives none of {draws} draws of the approximation a positive density; ask a "
+            "sampling engine"
+        )
+    smoothed, k = pareto_smoothed(raw)
+    stored = as_stored(problem, values)
+    found = CheckedPosterior(
+        problem, posterior.engine, stored, (1, draws), smoothed[None], independent=True
+    )
+    found.k = k
+    total = float(log_sum_exp(smoothed[None]))
+    found.log_marginal_likelihood = total - float(np.log(draws))
+    ess = found.weight_ess
+    assert ess is not None
+    found.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
+    return found
+
+
+def _doubt(check: Check) -> str:
+    words = (
+        f"check: the weights of {check.draws} draws of {type(check.approximate.engine).__name__} have a "
+        f"heavy tail (Pareto k = {check.k:.2f}, above {check.bound:.2f}): its answers cannot be trusted, "
+    )
+    own = check.posterior.k
+    if own < check.bound:
+        return (
+            words
+            + f"those corrected by draws with heavier tails (k = {own:.2f}) with care, since they rest "
+            f"on {check.posterior.weight_ess:.0f} draws' worth; better ask a sampling engine "
+            "(HamiltonianMonteCarlo(), Gibbs())"
+        )
+    return (
+        words
+        + "nor can the corrected ones; ask a sampling engine (HamiltonianMonteCarlo(), Gibbs())"
+    )
+
+
+def _bound(draws: int) -> float:
+    """The largest k at which so many draws do (Vehtari et al. 2024, eq. 13), 0.7 at most."""
+    return min(1.0 - 1.0 / float(np.log10(draws)), MAX_PARETO_K)

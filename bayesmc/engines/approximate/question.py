@@ -1,0 +1,128 @@
+"""What a mode is looked for in: the log density of all free numbers that matter, and where climbs start."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.mcmc.starts import start_states
+from bayesmc.errors import TraceError, UnsupportedError
+from bayesmc.network import Problem
+from bayesmc.network.expressions import Followed, density
+from bayesmc.structure.affine import NotLinearError, is_hidden, linear_node
+from bayesmc.structure.free_density import UnconstrainedDensity
+from bayesmc.structure.jumps import jumps
+from bayesmc.structure.target import Target, Values, target_of
+from bayesmc.structure.unconstrained import unconstrained_density
+
+#: free numbers up to which nodes that follow linearly are taken along
+_MOST = 2000
+#: starts are the same whatever the seed of the draws: a mode is no matter of chance
+_SEED = 20260
+
+
+def is_number(problem: Problem, name: str) -> bool:
+    """Whether a node is stochastic, continuous, and not wholly observed."""
+    return problem.model[name].kind == "stochastic" and is_hidden(
+        problem.model[name], problem.observed
+    )
+
+
+def free_density(problem: Problem, also: tuple[str, ...], who: str) -> UnconstrainedDensity:
+    """The log density of the continuous nodes of the chain and of some besides, finite ones summed out.
+
+    Raises
+    ------
+    UnsupportedError
+        It cannot be followed or has no gradient, it jumps, a node is discrete without finite states or has
+        too many, or there is nothing continuous.
+    """
+    kept = problem.cache.setdefault("densities of modes", {})
+    if also not in kept:
+        try:
+            kept[also] = _made(target_of(problem, also), who)
+        except UnsupportedError as error:
+            kept[also] = f"{who}: {error}"
+    if isinstance(kept[also], str):
+        raise UnsupportedError(kept[also])
+    return kept[also]
+
+
+def linear_below(problem: Problem) -> tuple[str, ...]:
+    """Nodes on which nothing observed depends that are Normal, linear in the chain's numbers, of known scale.
+
+    Taken along they leave the mode and the curvature of the others as they are, and have closed answers.
+    """
+    model, target = problem.model, target_of(problem)
+    hidden = frozenset(n for n, node in model.nodes.items() if is_hidden(node, problem.observed))
+    inside = {n for n in target.chain if n in hidden}
+    size = sum(math.prod(model[n].value_shape) for n in inside)
+    found: list[str] = []
+    for name in target.forward:
+        size += math.prod(model[name].value_shape)
+        if name in hidden and size <= _MOST and _is_linear(problem, target, name, hidden, inside):
+            inside.add(name)
+            found.append(name)
+    return tuple(found)
+
+
+def start_points(
+    density: UnconstrainedDensity, starts: int, given: Values | None = None
+) -> np.ndarray:
+    """Free numbers from which to climb, shape (starts, size): draws of the prior, weighed by the data."""
+    rng = np.random.default_rng(_SEED)
+    with marking_invalid(), np.errstate(all="ignore"):
+        values = start_states(density.target, starts, rng, given)
+        found = np.broadcast_to(density.unconstrain(values), (starts, density.size))
+    found = np.clip(np.where(np.isnan(found), 0.0, found), -30.0, None)
+    finite = np.isfinite(found).all(axis=1) & (density.value(found) > -np.inf)
+    return np.unique(found[finite], axis=0) if finite.any() else np.zeros((1, density.size))
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _made(target: Target, who: str) -> UnconstrainedDensity:
+    problem = target.problem
+    numbers = [n for n in target.chain if is_number(problem, n)]
+    if not numbers:
+        raise UnsupportedError(_nothing(target))
+    density = unconstrained_density(target, None, [n for n in target.chain if n not in numbers])
+    bounds = frozenset().union(*(b.leaves for node in density.nodes for b in node.bounds))
+    for name in sorted(bounds & set(density.summed)):
+        raise UnsupportedError(
+            f"node {name!r} is to be summed out, and the bounds of a continuous node depend on it; use Gibbs"
+        )
+    jumping = sorted(jumps(density))
+    if jumping:
+        raise UnsupportedError(
+            f"the density jumps at some values of node {jumping[0]!r}, so that its curvature tells nothing; "
+            "use Gibbs or MetropolisHastings"
+        )
+    return density
+
+
+def _nothing(target: Target) -> str:
+    if target.chain:
+        names = ", ".join(map(repr, target.chain[:4]))
+        return f"what observations depend on is finite ({names}): there is no curvature; use Exact or Gibbs"
+    return "nothing observed depends on a hidden continuous node; use LikelihoodWeighting"
+
+
+def _is_linear(
+    problem: Problem, target: Target, name: str, hidden: frozenset[str], inside: set[str]
+) -> bool:
+    model = problem.model
+    read = density(model, name)
+    if not isinstance(read, Followed) or len(model[name].event_shape) > 1:
+        return False
+    varying = {*target.chain, *target.forward, *target.links}
+    if (read.leaves & varying) - inside:
+        return False
+    try:
+        linear_node(model, name, hidden, frozenset(), target.known)
+    except (NotLinearError, TraceError):
+        return False
+    return True

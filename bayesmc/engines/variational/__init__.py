@@ -1,0 +1,1 @@
+"""Variational inference: the best approximation among distributions in which nodes are independent."""
