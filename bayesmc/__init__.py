@@ -63,8 +63,8 @@ from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
-from bayesmc.engines.switching.propagation import ExpectationPropagation
 from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
@@ -82,6 +82,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Affine",
+    "AssumedDensity",
     "BayesNet",
     "Bernoulli",
     "Beta",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 from benchmarks import (
+    bench_approximate,
     bench_exact,
     bench_gaussian,
     bench_gibbs,
@@ -37,6 +38,8 @@ if __name__ == "__main__":
     bench_time.main(sys.argv[1:])
     print()
     bench_switching.main()
+    print()
+    bench_approximate.main()
     print()
     bench_marginal.main()
     print()

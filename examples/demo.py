@@ -16,6 +16,7 @@ from examples import (
     bioassay,
     ceiling_robot,
     central_limit,
+    clutter,
     colour_map,
     corridor_doors,
     coupled_chains,
@@ -34,6 +35,7 @@ from examples import (
     old_faithful,
     parzen,
     picture,
+    probit_regression,
     pushforward,
     radar_target,
     range_only,
@@ -41,6 +43,7 @@ from examples import (
     sonar_localization,
     stochastic_volatility,
     three_views,
+    trueskill,
     van_der_merwe,
     variational_mixture,
     weight_collapse,
@@ -51,9 +54,10 @@ FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
-    banana, bioassay, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
-    landmark_localization, range_only, coupled_chains, radar_target, bee_dance, gnp_trend_cycle,
-    variational_mixture, colour_map,
+    banana, bioassay, clutter, trueskill, probit_regression, corridor_doors, ceiling_robot,
+    laser_localization, sonar_localization, kidnapped_robot, landmark_localization, range_only,
+    coupled_chains, radar_target, bee_dance, gnp_trend_cycle, variational_mixture,
+    colour_map,
 )  # fmt: skip
 
 

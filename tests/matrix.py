@@ -189,6 +189,10 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
         by_check(bmc.MeanField(restarts=2), 4000),
         {"discrete": 0.2, "plates": 0.2, "hybrid": 0.2, "hybrid plates": 0.2, "gaussian": 0.2},
     ),
+    "ExpectationPropagation, corrected": (
+        by_check(bmc.ExpectationPropagation(), 4000),
+        dict.fromkeys(KINDS, 0.5),
+    ),
     "no engine named": (by(None), dict.fromkeys(KINDS, 0.9)),
 }
 

@@ -59,6 +59,10 @@ APPROXIMATIONS: dict[str, tuple[Any, Allowed]] = {
         # of few states the largest weights are equal (k is minus infinity), and the others need not be
         Allowed(0.8, 0.8, 1.2, 1.5, dict.fromkeys(KINDS, 0.2), 0.8),
     ),
+    "ExpectationPropagation": (
+        bmc.ExpectationPropagation(),
+        Allowed(0.2, 0.2, 0.4, 0.4, dict.fromkeys(KINDS, 0.6)),
+    ),
 }
 
 

@@ -11,6 +11,7 @@ from bayesmc.auto.series import explained_series
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
+from bayesmc.engines.filtering import FilterEngine
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph
 
@@ -62,7 +63,8 @@ def explain(
       because hidden nodes are finite or linear-Gaussian: induced width 0, ...bytes
       a  eliminated
     """
-    if isinstance(net, DynamicBayesNet) and not isinstance(engine, Engine):
+    over_time = isinstance(engine, FilterEngine) or not isinstance(engine, Engine)
+    if isinstance(net, DynamicBayesNet) and over_time:
         try:
             explanation = explained_series(net, evidence, engine, inputs, question, keep, queries)
         except UnsupportedError as error:

@@ -188,7 +188,7 @@ def _checked(engine: Any) -> Any:
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"
         )
-    if isinstance(engine, FilterEngine):
+    if isinstance(engine, FilterEngine) and not isinstance(engine, Engine):
         raise TypeError(
             f"engine={type(engine).__name__}(...) answers over time; call filter, smooth, forecast or "
             "most_likely with it, or give infer a static engine (Gibbs(draws), ParticleGibbs(...), ...)"

@@ -63,64 +63,14 @@ class PropagatedSeries(SwitchingSeries):
 
 
 @dataclass(frozen=True)
-class ExpectationPropagation(SwitchingEngine):
-    """Smoothed beliefs about switching systems by messages that are passed until they agree.
-
-    For templates that ``SwitchingKalmanFilter`` takes: finite modes, and numbers that are linear-Gaussian
-    given them. Every slice has a belief with one Gaussian for each mode, the product of a message from the
-    rows up to it and one from later rows. A slice and the one before, with both messages that come from
-    outside, are a mixture over pairs of modes; it is collapsed to the belief of the same means and
-    covariances in each mode, and what came from outside is divided out again. The first pass forward is
-    assumed-density filtering, the same as ``SwitchingKalmanFilter("gpb2")``.
-
-    Answers are approximate, the log marginal likelihood included, and nobody knows by how much, mostly less
-    than Kim's smoother. They are exact where modes make no difference to numbers, and with one mode. Messages
-    need not settle: then there is a warning that says by how much beliefs still change.
-
-    Parameters
-    ----------
-    sweeps : int
-        Passes back and forth, at most.
-    damping : float
-        Share of the old message that is kept, 0 or more and less than 1: slower, and steadier. Without any,
-        easy series settle in 3 to 10 sweeps instead of some 15, and others never do.
-    tolerance : float
-        Change of a sweep with which messages have settled; see ``PropagatedSeries.change``.
-    linearize : bool
-        Makes functions that are not affine linear at each mode's mean on the first pass forward.
-    max_modes : int
-        Modes above which it refuses.
-
-    Notes
-    -----
-    ``filter`` and ``forecast`` answer what the first pass forward says: rows up to a slice are what it
-    absorbs, and no message comes back. ``smooth`` takes all rows; of fixed lags ask
-    ``SwitchingKalmanFilter``.
-
-    Quotients of Gaussians may have no finite integral. A message that would leave a slice or a belief without
-    one is left out, and counted in ``skipped``; as long as some are, nothing has settled. Numbers of a slice
-    that later rows tell without noise would make messages infinite, and are refused as they are met.
+class SeriesPropagation(SwitchingEngine):
+    """``ExpectationPropagation`` as an engine over time, where it says what it does.
 
     References
     ----------
     Heskes and Zoeter (2002), Expectation propagation for approximate inference in dynamic Bayesian networks,
     UAI 18 (two-slice beliefs alpha_{t-1} psi_t beta_t, collapsed and divided); Zoeter and Heskes (2005),
-    Change point problems in linear dynamical systems, JMLR 6; Minka (2001), Expectation propagation for
-    approximate Bayesian inference; of the evidence: Minka (2004), Power EP.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import bayesmc as bmc
-    >>> dbn = bmc.DynamicBayesNet("level that jumps")
-    >>> dbn.table("s", ["s_prev"], [[0.95, 0.05], [0.5, 0.5]], ("still", "jump"), initial=[0.9, 0.1])
-    >>> dbn.add("x", lambda x_prev, s: bmc.Normal(x_prev, np.where(s == "jump", 5.0, 0.1)),
-    ...         initial=bmc.Normal(0.0, 1.0))
-    >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
-    >>> rows = {"y": [0.1, -0.2, 0.1, 6.2, 5.9]}
-    >>> smoothed = bmc.smooth(dbn, rows, engine=bmc.ExpectationPropagation())
-    >>> smoothed.converged, smoothed.probabilities("s")[:, 1].round(2).tolist()
-    (True, [0.06, 0.02, 0.07, 1.0, 0.13])
+    Change point problems in linear dynamical systems, JMLR 6.
     """
 
     sweeps: int = 100
@@ -133,18 +83,7 @@ class ExpectationPropagation(SwitchingEngine):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sweeps = self.sweeps
-        if isinstance(sweeps, bool) or not isinstance(sweeps, (int, np.integer)) or sweeps < 1:
-            raise ValueError(f"ExpectationPropagation(sweeps={sweeps!r}): give a number, 1 or more")
-        if not _is_number(self.damping) or not 0.0 <= self.damping < 1.0:
-            raise ValueError(
-                f"ExpectationPropagation(damping={self.damping!r}): give a share of the old message, 0 or "
-                "more and less than 1"
-            )
-        if not _is_number(self.tolerance) or not 0.0 < self.tolerance < np.inf:
-            raise ValueError(
-                f"ExpectationPropagation(tolerance={self.tolerance!r}): give a number above 0"
-            )
+        check_options(self)
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         return _NO_LAGS if asked.what == "fixed-lag" else super().unable(problem, asked)
@@ -217,7 +156,7 @@ class _Messages:
                 pairs = run.places[k].stretch.pairs
                 self.factors.append(SliceFactor(k, pairs, back, self.filtered[k], self.scales))
 
-    def passed(self, engine: ExpectationPropagation, advance: Any) -> Propagated:
+    def passed(self, engine: SeriesPropagation, advance: Any) -> Propagated:
         """Back and forth until nothing changes."""
         count = len(self.factors)
         both = list(zip(self.scales, self.filtered, strict=True))
@@ -251,6 +190,19 @@ class _Messages:
         return found
 
 
+def check_options(engine: Any) -> None:
+    """Refuse sweeps, damping and tolerance that make no sense."""
+    name, sweeps = type(engine).__name__, engine.sweeps
+    if isinstance(sweeps, bool) or not isinstance(sweeps, (int, np.integer)) or sweeps < 1:
+        raise ValueError(f"{name}(sweeps={sweeps!r}): give a number, 1 or more")
+    if not _is_number(engine.damping) or not 0.0 <= engine.damping < 1.0:
+        raise ValueError(
+            f"{name}(damping={engine.damping!r}): give a share of the old message, 0 or more and less than 1"
+        )
+    if not _is_number(engine.tolerance) or not 0.0 < engine.tolerance < np.inf:
+        raise ValueError(f"{name}(tolerance={engine.tolerance!r}): give a number above 0")
+
+
 def _sizes(message: ConditionalGaussian) -> tuple[int, tuple[int, ...], int]:
     shape = message.linear.shape
     return shape[0], shape[1:-1], shape[-1]
@@ -260,7 +212,7 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, (int, float, np.integer, np.floating))
 
 
-def _doubt(engine: ExpectationPropagation, end: Propagated) -> str:
+def _doubt(engine: SeriesPropagation, end: Propagated) -> str:
     """By how much messages have not settled."""
     whose = ""
     if end.converged.ndim:

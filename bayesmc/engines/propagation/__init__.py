@@ -1,0 +1,1 @@
+"""Expectation propagation on nets: what is approximated, by which messages, and what that answers."""

@@ -1,0 +1,231 @@
+"""Where messages ended, as a distribution: Gaussian components and finite variables side by side."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from bayesmc.distributions import Distribution, Normal
+from bayesmc.distributions.transforms import Transform
+from bayesmc.engines.approximate.approximation import Drawn, Marginal
+from bayesmc.engines.propagation.beliefs import Conjugates, normalised
+from bayesmc.engines.propagation.coordinates import Numbers
+from bayesmc.engines.propagation.system import System
+
+#: points of Gauss and Hermite for moments of mapped numbers
+_POINTS = 96
+#: degrees of freedom of heavier tails, and the share of even states there
+_DEGREES, _EVEN = 4.0, 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """Numbers between bounds whose free numbers are normal.
+
+    Attributes
+    ----------
+    transform : Transform
+    centre, spread : ndarray, shape (*plates, *event)
+        Of the free numbers.
+    seen : ndarray of bool
+        Where they are known.
+    """
+
+    transform: Transform
+    centre: np.ndarray
+    spread: np.ndarray
+
+    @cached_property
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+        x, w = np.polynomial.hermite_e.hermegauss(_POINTS)
+        shape = (-1, *(1,) * self.centre.ndim)
+        values = self.transform.constrain(self.centre + self.spread * x.reshape(shape))
+        weight = (w / w.sum()).reshape(shape)
+        mean = (weight * values).sum(axis=0)
+        return mean, (weight * (values - mean) ** 2).sum(axis=0)
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self._moments[0]
+
+    @property
+    def var(self) -> np.ndarray:
+        return self._moments[1]
+
+    def ppf(self, q: np.ndarray) -> np.ndarray:
+        """Quantiles: the map keeps the order, or turns it round."""
+        up, down = (
+            self.transform.constrain(self.centre + self.spread * special.ndtri(level))
+            for level in (q, 1.0 - np.asarray(q))
+        )
+        rises = self.transform.constrain(self.centre + 1.0) >= self.transform.constrain(self.centre)
+        return np.where(rises, up, down)
+
+
+class Messages:
+    """What ``ApproximatePosterior`` asks of where messages ended.
+
+    Finite variables, and each set of numbers that hang together, are independent of each other in it,
+    whatever they are in the model; numbers of one set are jointly normal in their free coordinates.
+    """
+
+    coordinates = "numbers jointly Gaussian (mapped where bounded), finite nodes each by itself"
+
+    def __init__(self, system: System) -> None:
+        self.model = system.target.model
+        self.names = system.target.chain
+        self._beliefs, self._numbers, self._places = system.beliefs, system.numbers, system.places
+        self._kept = system.kept
+
+    def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
+        """Independent joint draws of all nodes in ``names``."""
+        values, own, _ = self._drawn(rng, np.zeros(draws, dtype=bool))
+        return Drawn(values, own)
+
+    def spread(self, rng: np.random.Generator, draws: int) -> Drawn:
+        """Half of the draws its own, half with heavier tails: a defensive mixture (Hesterberg 1995).
+
+        Numbers that hang together are of a multivariate t, states are mixed with even ones, members of other
+        families have half the weight.
+        """
+        values, own, wide = self._drawn(rng, rng.random(draws) < 0.5)
+        return Drawn(values, np.logaddexp(own, wide) - np.log(2.0))
+
+    def marginal(self, name: str) -> Marginal | None:
+        """Of a node by itself; of simplexes and matrices by draws."""
+        if name in self._kept:
+            held, rows = self._held(name)
+            node = self.model[name]
+            natural = held.naturals[rows].reshape(*node.plate_shape, -1)
+            return held.family.marginal(natural, bool(node.event_shape))
+        x = self._numbers.get(name)
+        if x is None or x.transform.unconstrained_shape != x.node.event_shape:
+            return None
+        mean, var = self._beliefs.variances(np.maximum(x.at, 0).reshape(-1))
+        shape = x.node.value_shape
+        hidden = (x.at >= 0).reshape(-1)
+        centre = np.where(hidden, mean, x.seen.reshape(-1)).reshape(shape)
+        spread = np.where(hidden, np.sqrt(var), 0.0).reshape(shape)
+        if x.is_plain and hidden.all():
+            found: Distribution = Normal(centre, spread)
+            return found
+        return Mapped(x.transform, centre, spread)
+
+    def probabilities(self, name: str) -> np.ndarray | None:
+        """Probabilities of the states of a finite node."""
+        node = self.model[name]
+        if name not in self.names or node.domain is None:
+            return None
+        table = np.exp(normalised(self._logs(name)))
+        return table.reshape(*node.plate_shape, node.domain.size)
+
+    def covariance(self, *names: str) -> np.ndarray | None:
+        """Of numbers that are as they are; others by draws."""
+        parts = [self._numbers.get(n) for n in names]
+        if any(x is None or not x.is_plain for x in parts):
+            return None
+        at = np.concatenate([x.at.reshape(-1) for x in parts if x is not None])
+        _, cov = self._beliefs.moments(np.maximum(at, 0))
+        known = at < 0
+        return np.where(known[:, None] | known, 0.0, cov)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        model = self.model.without_functions()
+        numbers = {n: replace(x, node=model[n]) for n, x in self._numbers.items()}
+        return {**self.__dict__, "model": model, "_numbers": numbers}
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _drawn(
+        self, rng: np.random.Generator, is_wide: np.ndarray
+    ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+        """Draws, some with heavier tails; log densities of all of them without these, and with."""
+        beliefs, draws = self._beliefs, len(is_wide)
+        free = np.zeros((draws, len(beliefs.size)))
+        own, wide = np.zeros(draws), np.zeros(draws)
+        for k, block in enumerate(beliefs.blocks):
+            mine = np.flatnonzero(beliefs.size == k)
+            root = np.linalg.cholesky(block.cov)
+            noise = rng.standard_normal((draws, *block.linear.shape))
+            longer = np.sqrt(_DEGREES / rng.chisquare(_DEGREES, noise.shape[:2]))
+            noise *= np.where(is_wide[:, None], longer, 1.0)[..., None]
+            value = block.mean + np.matvec(root, noise)
+            free[:, mine] = value[:, beliefs.component[mine], beliefs.place[mine]]
+            size = np.log(root.diagonal(0, -2, -1)).sum()
+            normal, heavy = _log_densities((noise**2).sum(axis=-1), noise.shape[-1])
+            own, wide = own + normal.sum(axis=-1) - size, wide + heavy.sum(axis=-1) - size
+        values = {}
+        for name in self.names:
+            node, x = self.model[name], self._numbers.get(name)
+            if x is not None:
+                values[name], size = x.whole(free), _volume(x, free)
+                own, wide = own - size, wide - size
+            elif name in self._kept:
+                held, rows = self._held(name)
+                natural = held.naturals[rows]
+                both = [held.family.member(n) for n in (natural, held.family.widened(natural))]
+                one, two = (dist.sample(rng, (draws,)) for dist in both)
+                drawn = np.where(is_wide.reshape(-1, *(1,) * (one.ndim - 1)), two, one)
+                own, wide = (
+                    log + dist.log_prob(drawn).sum(axis=-1)
+                    for log, dist in zip((own, wide), both, strict=True)
+                )
+                if not node.event_shape and drawn.ndim == 3:  # the first of two shares
+                    drawn = drawn[..., 0]
+                values[name] = drawn.reshape(draws, *node.value_shape)
+            else:
+                assert node.domain is not None
+                table = normalised(self._logs(name))
+                even = np.logaddexp(table + np.log(1 - _EVEN), np.log(_EVEN / node.domain.size))
+                chosen = np.where(is_wide[:, None, None], even, table)
+                codes = (chosen + rng.gumbel(size=(draws, *table.shape))).argmax(axis=-1)
+                own, wide = (
+                    log
+                    + np.take_along_axis(t[None], codes[..., None], axis=-1)[..., 0].sum(axis=-1)
+                    for log, t in ((own, table), (wide, even))
+                )
+                values[name] = codes.reshape(draws, *node.plate_shape).astype(node.domain.dtype)
+        return values, own, wide
+
+    def _held(self, name: str) -> tuple[Conjugates, np.ndarray]:
+        kept = self._kept[name]
+        return self._beliefs.families[kept.field], kept.rows
+
+    def _logs(self, name: str) -> np.ndarray:
+        """Log beliefs of all elements of a finite node."""
+        places = [self._places[name, e] for e in range(math.prod(self.model[name].plate_shape))]
+        if not places:
+            domain = self.model[name].domain
+            assert domain is not None
+            return np.zeros((0, domain.size))
+        return self._beliefs.finite[places[0][0]].logs[[at for _, at in places]]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _log_densities(square: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Of standard normal vectors of n numbers, and of standard t ones, by their squared lengths."""
+    normal = -0.5 * (square + n * np.log(2.0 * np.pi))
+    half = 0.5 * (_DEGREES + n)
+    heavy = (
+        special.gammaln(half) - special.gammaln(0.5 * _DEGREES) - half * np.log1p(square / _DEGREES)
+    )
+    return normal, heavy - 0.5 * n * np.log(_DEGREES * np.pi)
+
+
+def _volume(x: Numbers, free: np.ndarray) -> np.ndarray:
+    """Log changes of volume of a node's hidden elements, shape (draws,)."""
+    if x.is_plain:
+        return np.zeros(len(free))
+    own = np.where(x.at >= 0, free[:, np.maximum(x.at, 0)], x.seen)
+    shape = x.node.plate_shape + x.transform.unconstrained_shape
+    logs = x.transform.log_abs_det_jacobian(own.reshape(len(free), *shape))
+    logs = np.broadcast_to(logs, (len(free), *x.node.plate_shape)).reshape(len(free), -1)
+    return np.where((x.at >= 0).all(axis=-1), logs, 0.0).sum(axis=-1)

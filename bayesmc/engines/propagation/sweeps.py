@@ -1,0 +1,164 @@
+"""Messages passed until beliefs settle: batches in turn, forth and back, each in array operations.
+
+All factors of a batch are made anew from the same beliefs and move them together, by a share of the way
+(parallel updates); batches follow each other. Where that does not come closer the share gets smaller.
+Assumed-density filtering visits one factor after the other, once, in the order of declaration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs
+from bayesmc.engines.propagation.system import System
+from bayesmc.errors import ZeroProbabilityError
+
+#: sweeps after which the change must have shrunk by a factor; else shares do, down to the smallest
+_PATIENCE, _SHRUNK, _SHARE, _LEAST = 8, 0.5, 0.6, 0.02
+#: probabilities below this do not count as changed
+_TINY = 1e-12
+
+
+@dataclass(frozen=True)
+class Settled:
+    """How it ended.
+
+    Attributes
+    ----------
+    converged : bool
+    sweeps : int
+    change : float
+        By how much the last sweep changed the scalar's marginal that it changed most: the root of the
+        symmetric Kullback-Leibler divergence.
+    skipped, open : int
+        Improper messages left out, in all sweeps and in the last.
+    log_total : float
+        Approximate log evidence; NaN where some factor has no integral with its cavity.
+    error : float
+        Of quadrature and importance sampling, the worst: what coarser rules differ by.
+    share : float
+        The share of the way that beliefs moved in the end.
+    log_as_met : float or None
+        Of one pass: the sum of the logs of factors' integrals with the belief that each of them met.
+    """
+
+    converged: bool
+    sweeps: int
+    change: float
+    skipped: int
+    open: int
+    log_total: float
+    error: float
+    share: float
+    log_as_met: float | None = None
+
+
+def settle(
+    system: System,
+    *,
+    sweeps: int,
+    damping: float,
+    tolerance: float,
+    advance: Callable[[], None] | None = None,
+) -> Settled:
+    """Pass messages until nothing changes, or ``sweeps`` times."""
+    beliefs, batches = system.beliefs, system.batches
+    order = [*batches, *reversed(batches[:-1])] if len(batches) > 1 else batches
+    share, skipped, left, change, done = 1.0 - damping, 0, 0, np.inf, 0
+    history: list[float] = []
+    if not any(b.count for b in batches):
+        _refresh(beliefs)
+        return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, share)
+    while done < sweeps:
+        before = _marginals(beliefs)
+        left = 0
+        for batch in batches:
+            batch.error = 0.0
+        for batch in order:
+            left += batch.visit(beliefs, share).skipped
+        change = _distance(before, _marginals(beliefs))
+        done, skipped = done + 1, skipped + left
+        if advance is not None:
+            advance()
+        # a share of the way leaves the rest of it: what is ahead is judged, not the step
+        if change <= tolerance * share:
+            break
+        history.append(change)
+        if len(history) > _PATIENCE and change > _SHRUNK * history[-1 - _PATIENCE]:
+            share, history = max(share * _SHARE, _LEAST), []
+    _refuse_impossible(system)
+    error = max((b.error for b in batches), default=0.0)
+    settled = bool(change <= tolerance * share and not left)
+    return Settled(settled, done, float(change), skipped, left, _evidence(system), error, share)
+
+
+def pass_once(system: System) -> Settled:
+    """Every factor visited once, one after the other, in the order of declaration."""
+    beliefs, skipped = system.beliefs, 0
+    for batch in system.batches:
+        for k in range(batch.count):
+            skipped += batch.visit(beliefs, 1.0, np.array([k])).skipped
+    _refuse_impossible(system, at_all=True)
+    met = system.log_scale + beliefs.log_total + sum(float(b.logs.sum()) for b in system.batches)
+    total = _evidence(system)
+    error = max((b.error for b in system.batches), default=0.0)
+    return Settled(not skipped, 1, 0.0, skipped, skipped, total, error, 1.0, met)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _refresh(beliefs: Beliefs) -> None:
+    for block in beliefs.blocks:
+        if len(block.linear):
+            block.refreshed()
+
+
+def _marginals(beliefs: Beliefs) -> list[tuple[np.ndarray, ...]]:
+    found: list[tuple[np.ndarray, ...]] = [
+        (b.mean.copy(), b.cov.diagonal(0, -2, -1).copy()) for b in beliefs.blocks
+    ]
+    found += [
+        (c.naturals.copy(), c.family.expected(c.naturals), c.naturals) for c in beliefs.families
+    ]
+    return found + [(f.probabilities,) for f in beliefs.finite]
+
+
+def _distance(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray, ...]]) -> float:
+    """The root of the symmetric Kullback-Leibler divergence of the marginal that differs most."""
+    worst = 0.0
+    for one, two in zip(before, after, strict=True):
+        if not one[0].size:
+            continue
+        if len(one) == 2:
+            ratio = one[1] / two[1]
+            square = (one[0] - two[0]) ** 2
+            apart = 0.5 * (ratio + 1.0 / ratio - 2.0) + 0.5 * square * (1.0 / one[1] + 1.0 / two[1])
+        elif len(one) == 3:
+            apart = ((two[0] - one[0]) * (two[1] - one[1])).sum(axis=-1)
+        else:
+            p, q = (np.maximum(a[0], _TINY) for a in (one, two))
+            apart = ((p - q) * np.log(p / q)).sum(axis=-1)
+        worst = max(worst, float(np.nan_to_num(apart, nan=np.inf).max()))
+    return float(np.sqrt(max(worst, 0.0)))
+
+
+def _evidence(system: System) -> float:
+    beliefs = system.beliefs
+    parts = [float(b.constants(beliefs).sum()) for b in system.batches if b.count]
+    return system.log_scale + beliefs.log_total + sum(parts)
+
+
+def _refuse_impossible(system: System, at_all: bool = False) -> None:
+    """Tables that contradict each other give every state of a variable no probability."""
+    for finite in system.beliefs.finite:
+        if finite.logs.size and (finite.logs.max(axis=-1) < NOTHING).any():
+            raise ZeroProbabilityError("ExpectationPropagation: the evidence has probability zero")
+    for batch in system.batches:
+        if (batch.logs < batch.floor).any():
+            raise ZeroProbabilityError(
+                f"ExpectationPropagation: the evidence has probability zero at node {batch.name!r}"
+            )
