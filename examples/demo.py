@@ -17,6 +17,7 @@ from examples import (
     ceiling_robot,
     central_limit,
     clutter,
+    colour_map,
     corridor_doors,
     coupled_chains,
     diagnosis,
@@ -58,6 +59,7 @@ FIGURES = (
     laser_localization, sonar_localization, kidnapped_robot, landmark_localization, range_only,
     coupled_chains, radar_target, bee_dance, gnp_trend_cycle, variational_mixture,
     fading_channel,
+    colour_map,
 )  # fmt: skip
 
 

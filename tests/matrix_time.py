@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc.dbn import pose_series
+from bayesmc.engines.marginal.options import split_of_problem
 from bayesmc.errors import (
     BudgetError,
     DegeneracyError,
@@ -159,6 +161,23 @@ def answered(case: Series, engine: Any, seed: int) -> Any:
             return None
     assert all(issubclass(w.category, DOUBTS) for w in caught)
     return None if caught else posterior
+
+
+def tabled(case: Series, seed: int) -> bmc.ParticleFilter | None:
+    """A filter with tables of one finite node of a template, or of two, and others sampled; or None."""
+    problem = pose_series(case.dbn, case.observations, case.inputs)
+    nodes = [n for n in problem.slices.stochastic if n not in problem.seen]
+    rng = np.random.default_rng(seed)
+    for count in (2, 1, 1, 1) if nodes else ():
+        names = rng.permutation(nodes)[:count].tolist()
+        proposal = "optimal" if seed % 2 else None
+        engine = bmc.ParticleFilter(50, marginalize=names, proposal=proposal)
+        if engine.unsupported(case.dbn, case.observations, inputs=case.inputs) is None:
+            split = split_of_problem(engine, problem)
+            if split is not None and split.tables is not None:
+                if any(n not in split.waiting for n in nodes):
+                    return engine
+    return None
 
 
 def unbiased(case: Series, engine: bmc.ParticleFilter) -> tuple[Callable[[Any], Any], Any]:

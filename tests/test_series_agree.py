@@ -45,6 +45,7 @@ from tests.matrix_time import (
     cases,
     hidden,
     stated,
+    tabled,
     unbiased,
 )
 from tests.stated import stated_errors_test
@@ -137,6 +138,30 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
         found = repeated_test(estimate, right, replications=RUNS, **options)
         assert found, (case.dbn, found)
         tried += 1
+    assert tried
+
+
+def test_particle_filters_with_tables_have_no_bias() -> None:
+    """Evidence, and filtered figures of all nodes, where some finite ones are integrated out by name."""
+    tried = 0
+    for seed, case in cases("finite", 6 * FEW):
+        engine = tabled(case, seed)
+        if engine is None:
+            continue
+        options: dict[str, Any] = {"alpha": ALPHA, "rng": np.random.SeedSequence([seed, 11])}
+        evidence = unbiased_evidence_test(
+            engine, case.dbn, case.observations, inputs=case.inputs, replications=100, **options
+        )
+        assert not evidence.rejected, (case.dbn, engine.marginalize, evidence)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            if not np.log(evidence.ratios).std() <= EVEN:
+                continue
+        estimate, right = unbiased(case, engine)
+        found = repeated_test(estimate, right, replications=RUNS, **options)
+        assert found, (case.dbn, engine.marginalize, found)
+        tried += 1
+        if tried == FEW:
+            break
     assert tried
 
 

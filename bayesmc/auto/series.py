@@ -17,7 +17,7 @@ from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.marginal.options import split_of_problem
+from bayesmc.engines.marginal.options import is_worth_it, without_tables
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
@@ -238,14 +238,15 @@ def explained_series(
     asked = Asked(question, keep, read_queries("explain", queries))
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
-        nodes = chosen.describe(problem)
+        nodes = without_tables(chosen, question).describe(problem)
         return Explanation(
             chosen, reasons, refused, nodes, effort=chosen.effort_for(problem, asked)
         )
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
     if why is None:
-        nodes, effort = checked.describe(problem), checked.effort_for(problem, asked)
+        teller = without_tables(checked, question)
+        nodes, effort = teller.describe(problem), teller.effort_for(problem, asked)
         return Explanation(checked, ("it was asked for",), {}, nodes, effort=effort)
     reasons = ("it was asked for, but it cannot answer",)
     return Explanation(checked, reasons, {type(checked).__name__: why})
@@ -307,7 +308,7 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
                 late.append(engine)
         if reason is None:
             instead = _instead(engine, displaced, asked, refused)
-            why = engine.reasons(problem) or (_WHY[name],)
+            why = without_tables(engine, asked.what).reasons(problem) or (_WHY[name],)
             return _Chosen(engine, why if instead is None else (*why, instead), refused, instead)
         refused[name] = reason
     if late:  # nothing that is better can answer
@@ -325,7 +326,10 @@ def _made(candidate: type[FilterEngine], problem: SeriesProblem, asked: Asked) -
     """A candidate; particles integrate out what they can, where they answer what is asked then."""
     if candidate is ParticleFilter and common_refusal(ParticleFilter(), problem) is None:
         engine = ParticleFilter(marginalize="auto")
-        if split_of_problem(engine, problem) and _why_not(engine, problem, asked) is None:
+        if (
+            is_worth_it(without_tables(engine, asked.what), problem)
+            and _why_not(engine, problem, asked) is None
+        ):
             return engine
     return candidate()
 

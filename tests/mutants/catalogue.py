@@ -16,6 +16,7 @@ from tests.mutants import (
     propagated,
     slices,
     switching,
+    tables,
     variational,
 )
 from tests.mutants.mutant import Mutant
@@ -27,6 +28,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *tables.MUTANTS,
     *variational.MUTANTS,
     *factored.MUTANTS,
     *propagated.MUTANTS,

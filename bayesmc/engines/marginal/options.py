@@ -12,6 +12,8 @@ from bayesmc.engines.filtering import Asked
 from bayesmc.engines.marginal.choices import MOST
 from bayesmc.engines.marginal.smoothing import why_not_backwards
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.marginal.tables.step import refuse_seen_in_part
+from bayesmc.engines.marginal.tables.telling import tables_told
 from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.slice_steps import SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
@@ -19,6 +21,10 @@ from bayesmc.errors import UnsupportedError
 _SEEN = "observed, weights the particles by its predictive density"
 #: said of nodes whose means are not affine
 _BENT = "linearised at each particle's own mean"
+#: joint states of finite nodes up to which plain particles do, in bits
+FEW = 8.0
+#: questions about slices given rows that come after them
+PAST = ("smooth", "fixed-lag")
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
 
@@ -65,14 +71,33 @@ def split_asked(
     """
     if engine.marginalize is None:
         return None
-    known = frozenset(n for n in slices.stochastic if n in seen)
-    found = split_of(slices, known, engine.marginalize, static)
-    return found if found.inner else None
+    found = _whole(engine, slices, static, seen)
+    return found if found.inner or found.tables is not None else None
 
 
 def split_of_problem(engine: Any, problem: SeriesProblem) -> Split | None:
     """The same for a series."""
     return split_asked(engine, problem.slices, problem.known_static, problem.seen)
+
+
+def without_tables(engine: Any, what: str) -> Any:
+    """The same engine without tables of finite nodes where a question is about the past: they know none."""
+    if what not in PAST or getattr(engine, "marginalize", None) is None:
+        return engine
+    found = object.__new__(type(engine))
+    found.__dict__.update(engine.__dict__, tabled=False)
+    return found
+
+
+def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | None:
+    """Why a question about the past has no answer, or None."""
+    if what not in PAST:
+        return None
+    try:
+        split_of_problem(without_tables(engine, what), problem)
+    except UnsupportedError as error:
+        return f"ParticleFilter: {error}"
+    return None
 
 
 def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:
@@ -86,8 +111,13 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         return f"ParticleFilter: {error}"
     if split is None:
         return None
+    if split.tables is not None:
+        try:
+            refuse_seen_in_part(split.tables, problem.series.observed)
+        except UnsupportedError as error:
+            return str(error)
     slices = problem.slices
-    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.inner]
+    sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.waiting]
     if engine.proposal == "optimal":
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:
@@ -111,7 +141,7 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         return None
     for proposal in [] if asked is None else [*asked.first, *asked.later]:
         names = (*proposal.names, *proposal.parents)
-        inner = next((n for n in names if n.removesuffix(PREVIOUS) in split.inner), None)
+        inner = next((n for n in names if n.removesuffix(PREVIOUS) in split.waiting), None)
         if inner is not None:
             return (
                 f"{proposal.what} names {inner!r}, which marginalize= integrates out, so no particle has a "
@@ -120,18 +150,30 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     return None
 
 
+def is_worth_it(engine: Any, problem: SeriesProblem) -> bool:
+    """Whether it pays to integrate out where nobody asks for it: numbers do, and finite nodes by the many.
+
+    Plain particles are machine code, and meet all of a few states.
+    """
+    split = split_of_problem(engine, problem)
+    if split is None:
+        return False
+    return bool(split.inner) or (split.tables is not None and split.tables.joint > FEW)
+
+
 def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Why this engine is taken, where something is integrated out."""
     split = split_of_problem(engine, problem)
     if split is None:
         return ()
-    inner = ", ".join(repr(n) for n in split.inner if n not in problem.series.observed)
+    seen = problem.series.observed
+    inner = ", ".join(repr(n) for n in split.names if n not in seen or n not in split.inner)
     return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
 
 
 def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Computed nodes that keep trajectories from being drawn backwards: none that is integrated out."""
-    split = split_of_problem(engine, problem)
+    split = split_of_problem(without_tables(engine, PAST[0]), problem)
     if split is not None and why_not_backwards(problem.slices, split) is None:
         return ()
     return endless(problem.slices, problem.seen)
@@ -139,8 +181,8 @@ def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
 
 def back(engine: Any, problem: SeriesProblem, asked: Asked) -> str:
     """How smoothing is done, where something is integrated out."""
-    split = split_of_problem(engine, problem)
-    if split is None or asked.what not in ("smooth", "fixed-lag"):
+    split = split_of_problem(without_tables(engine, asked.what), problem)
+    if split is None or asked.what not in PAST:
         return ""
     if asked.what == "fixed-lag":
         return "a Kalman smoother along the ancestors of each particle"
@@ -155,9 +197,8 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
     found, slices = dict(treated), problem.slices
     if engine.marginalize is None:
         return found
-    known = frozenset(n for n in slices.stochastic if n in problem.seen)
-    split = split_of(slices, known, engine.marginalize, problem.known_static)
-    if not split.inner:
+    split = _whole(engine, slices, problem.known_static, problem.seen)
+    if not split.names:
         return found | {n: f"{found[n]}; not integrated out: {w}" for n, w in split.why.items()}
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
@@ -169,21 +210,38 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
                 found[name] = f"{_SEEN}; integrated out where it is missing"
         elif name in split.below:
             found[name] = _SEEN
-        elif name in split.why:
-            found[name] += f"; not integrated out: {split.why[name]}"
-        elif (
-            engine.proposal == "optimal" and name in slices.stochastic and name not in problem.seen
-        ):
-            found[name] = "sampled given the slice before and the row"
+        else:
+            drawn = name in slices.stochastic and name not in problem.seen
+            if drawn and engine.proposal == "optimal":
+                found[name] = "sampled given the slice before and the row"
+            if name in split.why:
+                found[name] += f"; not integrated out: {split.why[name]}"
     for name in split.linearised:
         found[name] += f"; {_BENT}"
+    if split.tables is not None:
+        found |= tables_told(split.tables, problem)
     return found
 
 
 def effort_told(engine: Any, problem: SeriesProblem) -> str:
     """What a slice takes, and what of it is an approximation, where something is integrated out."""
-    split, each = split_of_problem(engine, problem), "a Kalman filter for each particle"
-    if split is None or not split.linearised:
+    split = split_of_problem(engine, problem)
+    assert split is not None
+    parts = ["a Kalman filter"] * bool(split.inner) + ["tables"] * (split.tables is not None)
+    each = f"{' and '.join(parts)} for each particle"
+    if not split.linearised:
         return each
     names = ", ".join(repr(n) for n in problem.slices.dynamic if n in split.linearised)
     return f"{each}; the log marginal likelihood is an approximation of unknown error ({names} linearised)"
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _whole(
+    engine: Any, slices: Slices, static: Mapping[str, np.ndarray], seen: Collection[str]
+) -> Split:
+    """What is integrated out, though it be nothing."""
+    known = frozenset(n for n in slices.stochastic if n in seen)
+    tabled = getattr(engine, "tabled", True) and not getattr(engine, "delay", None)
+    return split_of(slices, known, engine.marginalize, static, tabled)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,11 +17,26 @@ from bayesmc.dbn import PREVIOUS, Row
 from bayesmc.engines.marginal.choices import Choices
 from bayesmc.engines.marginal.gaussians import Gaussians, nothing
 from bayesmc.engines.marginal.reading import Values
+from bayesmc.engines.marginal.tables.beliefs import Tables
+from bayesmc.engines.marginal.tables.step import Known
 from bayesmc.engines.particles.families import Scouts
 from bayesmc.engines.particles.rare_states import SCOUTS, Scouting, among, away, together
 from bayesmc.engines.particles.smc import Particles
 from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode
+
+
+class Carried(NamedTuple):
+    """What each scout believes of what is integrated out."""
+
+    inner: Gaussians
+    tables: Tables | None
+
+    def joined(self, parties: Sequence[Any], at: np.ndarray) -> Carried:
+        """Some of those of several parties, one after the other."""
+        inner = self.inner.joined([p._replace(inner=p.inner.inner) for p in parties], at)
+        tables = self.tables
+        return Carried(inner, tables and tables.joined([p.inner.tables for p in parties], at))
 
 
 class MarginalScouting(Scouting):
@@ -38,6 +53,8 @@ class MarginalScouting(Scouting):
         self.step = step
         inner = step.integrated | step.split.seen
         sampled = [n for n in step.slices.stochastic if n not in inner]
+        if step.tables is not None:
+            sampled = [n for n in sampled if n not in step.tables.plan.below]
         if step.blocks or any(step.slices.later[n].domain is None for n in sampled):
             self.nodes = ()
         self.nodes = tuple(n for n in self.nodes if n.name in sampled)
@@ -52,7 +69,7 @@ class MarginalScouting(Scouting):
         rng = np.random.default_rng([row.t, int(np.float64(now.increment).view(np.uint64))])
         try:
             parties = []
-            if scouts is not None and scouts.inner is not None:
+            if scouts is not None and isinstance(scouts.inner, Carried):
                 log = scouts.log_weights - float(now.increment)
                 parties.append(self._gone(scouts.values, scouts.inner, log, row, rng))
             parties += self._put(unmet, earlier, now, row, rng)
@@ -88,12 +105,14 @@ class MarginalScouting(Scouting):
             shared = value.ndim == len(self.slices.later[name].value_shape)
             values[name] = value if shared else value[at]
         carried += math.log(share)
-        return [self._gone(values, earlier.inner.taken(at), carried, row, rng, unmet)]
+        tables = earlier.tables and earlier.tables.taken(at)
+        beliefs = Carried(earlier.inner.taken(at), tables)
+        return [self._gone(values, beliefs, carried, row, rng, unmet)]
 
     def _gone(
         self,
         values: Mapping[str, np.ndarray],
-        inner: Gaussians | None,
+        beliefs: Carried | None,
         carried: np.ndarray,
         row: Row,
         rng: np.random.Generator,
@@ -101,6 +120,7 @@ class MarginalScouting(Scouting):
     ) -> Scouts:
         """Scouts one slice later, all of them or those of its states that are rare."""
         step, count = self.step, len(carried)
+        inner, tables = (None, None) if beliefs is None else beliefs
         place = step.place(row, inner)
         choices = self._choices.get(id(place))
         if choices is None:
@@ -109,13 +129,17 @@ class MarginalScouting(Scouting):
         before = nothing(place.layout, count) if inner is None else inner.carried()
         plain, own = dict(step.sampling.known(row)), dict[str, np.ndarray]()
         for name in self.slices.interface if inner is not None else ():
-            if name + PREVIOUS in place.reader.hidden_before:
+            if name + PREVIOUS in step.hidden_before(place):
                 continue
             value = values[name]
             shared = value.ndim == len(self.slices.later[name].value_shape)
             (plain if shared else own)[name + PREVIOUS] = value
         known = Values(plain, own, count)
         joint, made, _ = step.looked(place, choices, row, known, before)
+        if step.tables is not None:
+            joint = joint + step.tables.predicted(
+                row, Known({**plain, **own}, frozenset(own), count), tables, choices.values
+            )
         if unmet is not None:
             rare = among(choices.values, unmet)
             joint = np.where(rare, joint, -np.inf)
@@ -124,8 +148,15 @@ class MarginalScouting(Scouting):
         found: dict[str, Any] = {n: row.seen[n].value for n in row.seen}
         found |= step.chosen_values(place, choices, known, found, at)
         after = made.chosen(at)
+        later: Tables | None = None
+        if step.tables is not None:
+            each = {n for n, v in found.items() if v.ndim == step.ranks[n]}
+            every = Known({**plain, **own, **found}, frozenset(own) | each, count)
+            _, later, moves = step.tables.advanced(row, every, tables)
         found |= after.completed(rng)
+        if step.tables is not None:
+            found |= step.completed(row, every, found, (tables, later, moves), rng)
         for name in self.slices.dynamic:
             shape = (count, *self.slices.later[name].value_shape)
             found[name] = np.broadcast_to(found[name], shape)
-        return Scouts(found, log, 0.0, after)
+        return Scouts(found, log, 0.0, Carried(after, later))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -19,12 +19,15 @@ from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.kalman.reading import why_not_placed
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.marginal.linearised import why_not_bent
+from bayesmc.engines.marginal.tables.plan import MET, TablePlan, nodes_read
+from bayesmc.engines.marginal.tables.search import found_plan, is_finite, named_plan
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError, did_you_mean
 
 AUTO = "auto"
 #: why some numbers are not integrated out, but where they are measured and missing
 _ANGLE = "is an angle"
+_UNNAMED = "marginalize= does not name it"
 
 
 @dataclass(frozen=True)
@@ -40,9 +43,11 @@ class Split:
     below : frozenset of str
         Nodes seen that depend on these.
     why : dict
-        Hidden number that is sampled -> why it is not integrated out.
+        Hidden node that is sampled -> why it is not integrated out.
     linearised : dict
         Node whose mean is made linear at each particle's own mean -> why it must be.
+    tables : TablePlan or None
+        Finite nodes that are integrated out.
     """
 
     seen: frozenset[str]
@@ -50,6 +55,19 @@ class Split:
     below: frozenset[str]
     why: Mapping[str, str] = field(default_factory=dict, hash=False)
     linearised: Mapping[str, str] = field(default_factory=dict, hash=False)
+    tables: TablePlan | None = field(default=None, compare=False)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All nodes that are integrated out."""
+        return self.inner if self.tables is None else (*self.inner, *sorted(self.tables.names))
+
+    @property
+    def waiting(self) -> frozenset[str]:
+        """These, and what is worked out after them, of which no particle has a value that others may read."""
+        tables = self.tables
+        late = frozenset() if tables is None else tables.computed | (tables.below - self.seen)
+        return late.union(self.names)
 
 
 def split_of(
@@ -57,6 +75,7 @@ def split_of(
     seen: frozenset[str],
     asked: str | tuple[str, ...],
     static: Mapping[str, np.ndarray],
+    tabled: bool = True,
 ) -> Split:
     """The split that is asked for: ``"auto"``, which integrates out what it can, or nodes by name.
 
@@ -66,6 +85,8 @@ def split_of(
         Nodes that are seen in full in every slice.
     static : dict
         Values of the static nodes.
+    tabled : bool
+        Whether finite nodes may be integrated out.
 
     Raises
     ------
@@ -73,10 +94,9 @@ def split_of(
         A node that is named cannot be integrated out.
     """
     kept = slices.later.cache.setdefault("splits", {})
-    key = (seen, asked, tuple((n, np.asarray(v).tobytes()) for n, v in static.items()))
+    key = (seen, asked, tabled, tuple((n, np.asarray(v).tobytes()) for n, v in static.items()))
     if key not in kept:
-        search = _Search(slices, seen, static)
-        kept[key] = search.found() if asked == AUTO else search.named(tuple(asked))
+        kept[key] = _found(slices, seen, asked, static, tabled)
     return kept[key]
 
 
@@ -85,6 +105,8 @@ def blocks_of(slices: Slices, split: Split) -> tuple[str, ...]:
 
     All that depends on what is integrated out lives in them, and reads its own element of it.
     """
+    if not split.inner:
+        return ()
     layouts = layouts_of(slices, split.inner, ())
     placed = {n for layout in layouts for n in (*layout.placed, *layout.silent)}
     some = next(iter(placed))
@@ -112,6 +134,39 @@ def layouts_of(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _found(
+    slices: Slices,
+    seen: frozenset[str],
+    asked: str | tuple[str, ...],
+    static: Mapping[str, np.ndarray],
+    tabled: bool,
+) -> Split:
+    """Numbers first, then finite nodes that these leave."""
+    search = _Search(slices, seen, static)
+    if asked == AUTO:
+        numbers = search.found()
+        if not tabled:
+            return numbers
+        # what is measured and missing, of nothing that is integrated out, can as well wait for tables
+        loose = search.loose(numbers.inner)
+        apart_from = {*numbers.inner, *numbers.below} - loose
+        tables, why = found_plan(slices, search.hidden, seen, apart_from, static)
+        waits = frozenset() if tables is None else loose & tables.below
+        inner = tuple(n for n in numbers.inner if n not in waits)
+        why = {n: w for n, w in why.items() if not w.endswith(MET)}
+        return replace(numbers, inner=inner, why={**numbers.why, **why}, tables=tables)
+    finite = [n for n in asked if n in search.hidden and is_finite(slices, n)]
+    others = tuple(n for n in asked if n not in finite)
+    if finite and not tabled:
+        raise UnsupportedError(
+            f"marginalize= names {finite[0]!r}, and tables of finite nodes tell nothing of slices before "
+            f"(smooth, lag=, delay=); leave {', '.join(map(repr, finite))} out"
+        )
+    numbers = search.named(others, finite)
+    apart_from = {*numbers.inner, *numbers.below}
+    return replace(numbers, tables=named_plan(slices, finite, seen, apart_from, static))
 
 
 class _Search:
@@ -150,7 +205,9 @@ class _Search:
             inner = self._without(inner, self._given_up(inner, name), f"node {name!r} {reason}")
         return self._split(inner, self.why)
 
-    def named(self, names: tuple[str, ...]) -> Split:
+    def named(self, names: tuple[str, ...], finite: Collection[str] = ()) -> Split:
+        if not names and finite:
+            return self._split((), {n: _UNNAMED for n in self.hidden if n not in finite})
         for name in names:
             if name not in self.slices.dynamic:
                 raise UnsupportedError(
@@ -184,8 +241,13 @@ class _Search:
                 f"marginalize={list(names)} is not linear-Gaussian given the rest: node {name!r} {reason}; "
                 'name fewer, or give marginalize="auto"'
             )
-        why = {n: "marginalize= does not name it" for n in self.hidden if n not in inner}
+        why = {n: _UNNAMED for n in self.hidden if n not in inner and n not in finite}
         return self._split(inner, why)
+
+    def loose(self, inner: Collection[str]) -> frozenset[str]:
+        """Numbers integrated out that depend on none of the others, and that nothing reads."""
+        read = nodes_read(self.slices)
+        return frozenset(n for n in inner if n not in read and not self._above((n,), inner))
 
     # ---- private -------------------------------------------------------------------------------
 

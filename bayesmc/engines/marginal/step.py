@@ -28,6 +28,10 @@ from bayesmc.engines.marginal.linearised import LinearisedReader
 from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split, blocks_of
+from bayesmc.engines.marginal.tables.afterwards import drawn_afterwards
+from bayesmc.engines.marginal.tables.beliefs import Tables
+from bayesmc.engines.marginal.tables.groups import Moved
+from bayesmc.engines.marginal.tables.step import Known, TableFilter
 from bayesmc.engines.particles.filter_step import FilterStep, has_weight
 from bayesmc.engines.particles.smc import Particles, Selection
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals
@@ -95,32 +99,70 @@ class MarginalStep(FilterStep):
     ) -> None:
         super().__init__(plan, particles, resample, threshold, kept=kept)
         self.split, self.looks = split, proposals is None
+        #: the tables of finite nodes, if there are any
+        self.tables = None
         self.integrated = frozenset(split.inner)
+        if split.tables is not None:
+            self.tables = TableFilter(plan.slices, plan.apart, split.tables)
+            self.integrated |= split.tables.names
         self.sampling = MarginalPlan(plan.slices, plan.apart, plan.static, proposals)
         self.is_guided = self.looks or self.sampling.guided
         self._places: dict[Any, Place] = {}
         #: plates whose elements do not meet given what is sampled: small Gaussians instead of a large one
-        self.blocks = () if self.looks or plan.apart else blocks_of(plan.slices, split)
+        whole = self.looks or plan.apart or not split.inner
+        self.blocks = () if whole else blocks_of(plan.slices, split)
 
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
         place = self.place(row, None if earlier is None else earlier.inner)
         before, selection = self.chosen(earlier, row, rng)
-        before = {k: v for k, v in before.items() if k not in place.reader.hidden_before}
+        hidden = self.hidden_before(place)
+        before = {k: v for k, v in before.items() if k not in hidden}
         inner = nothing(place.layout, selection.particles)
+        tables = None
         if earlier is not None:
             inner = earlier.inner.carried().taken(selection.ancestors)
+            tables = earlier.tables and earlier.tables.taken(selection.ancestors)
         steps = place.steps
         if steps is None:
-            steps = self.sampling.steps_without(row, _left_out(place.layout))
+            steps = self.sampling.steps_without(row, self._left_out(place.layout))
         values, log = self.propagated(steps, row, before, selection, rng)
-        values, log, inner = self._taken(place, row, before, values, log, inner, selection, rng)
+        taken = place, row, before, values, log, inner, tables, selection, rng
+        values, log, inner = self._taken(*taken)
+        after: Any = None
+        if self.tables is not None:
+            known = self._known(row, before, values, selection)
+            more, after, moves = self.tables.advanced(row, known, tables)
+            log = log if place.choices is not None else log + more
         found = self.weighted(row, values, log, selection)
         if not has_weight(found):
             raise _degenerate(selection.particles, row)
         values |= inner.completed(rng)
+        if self.tables is not None:
+            values |= self.completed(row, known, values, (tables, after, moves), rng)
         for name in [n for n in values if n not in self.kept]:
             del values[name]
-        return found._replace(inner=inner._replace(seen=self.split.seen))
+        return found._replace(inner=inner._replace(seen=self.split.seen), tables=after)
+
+    def hidden_before(self, place: Place) -> frozenset[str]:
+        """Nodes of the slice before of which no particle has a value that others may read."""
+        hidden = place.reader.hidden_before
+        return hidden if self.tables is None else hidden | self.tables.hidden_before
+
+    def completed(
+        self,
+        row: Row,
+        known: Known,
+        values: Mapping[str, np.ndarray],
+        tables: tuple[Tables | None, Tables, Sequence[Moved]],
+        rng: np.random.Generator,
+    ) -> dict[str, np.ndarray]:
+        """A draw of all nodes with tables, and of what waits for these: tables before, now, and between."""
+        assert self.tables is not None
+        before, after, moves = tables
+        now, past = self.tables.completed(after, before, moves, row, known, rng)
+        every = {**known.values, **past, **values, **now}
+        out = self.tables.left_out(row.t == 0) - self.tables.plan.names
+        return now | drawn_afterwards(self.slices, row, out, every, known.particles, rng)
 
     def stored(self, row: Any, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """All values of the slice that particles have; those that are not kept go later."""
@@ -142,6 +184,7 @@ class MarginalStep(FilterStep):
         values: dict[str, np.ndarray],
         log: Any,
         inner: Gaussians,
+        tables: Tables | None,
         selection: Selection,
         rng: np.random.Generator,
     ) -> tuple[dict[str, np.ndarray], Any, Gaussians]:
@@ -156,6 +199,9 @@ class MarginalStep(FilterStep):
                 own = own.sum(axis=tuple(range(1, own.ndim)))
             return values, log + own, self._looking_back(inner, made, made.chosen(None), pattern)
         joint, made, coefficients = self.looked(place, place.choices, row, known, inner)
+        if self.tables is not None:
+            every = self._known(row, before, values, selection)
+            joint = joint + self.tables.predicted(row, every, tables, place.choices.values)
         own, at = place.choices.drawn(joint, rng)
         values |= self.chosen_values(place, place.choices, known, values, at)
         level = np.where(own > -np.inf, own, 0.0)
@@ -205,6 +251,24 @@ class MarginalStep(FilterStep):
             found[name] = whole[name] = layout.model.evaluate(name, whole)[0]
         return found
 
+    def _known(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        values: Mapping[str, np.ndarray],
+        selection: Selection,
+    ) -> Known:
+        """All values that tables may read."""
+        taken = {k: self.taken(k, v, selection.ancestors) for k, v in before.items()}
+        found = {**self.sampling.known(row), **taken, **values}
+        own = {n for n, v in found.items() if n in self.ranks and v.ndim == self.ranks[n]}
+        return Known(found, frozenset(own), selection.particles)
+
+    def _left_out(self, layout: Layout) -> frozenset[str]:
+        """Nodes of a slice that no particle has a value of yet, or whose density weighs beliefs."""
+        found = layout.unknown | layout.seen.keys()
+        return found if self.tables is None else found | self.tables.left_out(layout.first)
+
     def _values(
         self,
         place: Place,
@@ -239,15 +303,20 @@ class MarginalStep(FilterStep):
         key = (row.t == 0, carried, partly, full)
         if key not in self._places:
             late = (self.split.seen - full) & self.split.below
-            known = full | (frozenset(self.slices.stochastic) - self.integrated - late)
+            known = full | (frozenset(self.slices.stochastic) - set(self.split.inner) - late)
             unknown = unknown_nodes(self.slices, row.t == 0, known, carried)
             apart = (*self.layout.apart, *self.blocks)
             layout = Layout(self.slices, apart, row.t == 0, carried, unknown)
+            if self.tables is not None:
+                layout = self.tables.without(layout)
             guarded = [n for n in layout.seen if n not in full]
-            if guarded:
+            pair = (sorted(late)[0], guarded[0]) if guarded else None
+            if self.tables is not None and pair is None:
+                pair = self.tables.unexplained(full, self.split.seen)
+            if pair is not None:
                 raise UnsupportedError(
-                    f"ParticleFilter(marginalize=...): {sorted(late)[0]!r} is missing in slice {row.t}, and "
-                    f"{guarded[0]!r}, which is sampled, depends on it; start with a row that lacks it, or "
+                    f"ParticleFilter(marginalize=...): {pair[0]!r} is missing in slice {row.t}, and "
+                    f"{pair[1]!r}, which is sampled, depends on it; start with a row that lacks it, or "
                     "give marginalize=None"
                 )
             choices = Choices(layout, full, self.sampling) if self.looks else None
@@ -255,7 +324,7 @@ class MarginalStep(FilterStep):
                 choices = None
             steps: list[Step] | None = [] if choices is not None else None
             if choices is None and not partly:
-                steps = self.sampling.steps_without(row, _left_out(layout))
+                steps = self.sampling.steps_without(row, self._left_out(layout))
             bent = any(n in self.split.linearised for n in layout.placed)
             reader = LinearisedReader(layout) if bent else SliceReader(layout)
             self._places[key] = Place(layout, reader, steps, choices)
@@ -277,11 +346,6 @@ def seen_of(layout: Layout, row: Row) -> tuple[Pattern, np.ndarray, np.ndarray |
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _left_out(layout: Layout) -> frozenset[str]:
-    """Nodes of a slice that no particle has a value of, and those whose density weighs Gaussians."""
-    return layout.unknown | layout.seen.keys()
 
 
 def _degenerate(particles: int, row: Row) -> DegeneracyError:

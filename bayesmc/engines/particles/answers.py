@@ -9,7 +9,8 @@ import numpy as np
 
 from bayesmc.engines.averages import as_event, called
 from bayesmc.engines.marginal.mixtures import covariance_within, mixture_quantiles
-from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.marginal.tables.answers import table_covariance, table_quantiles
+from bayesmc.engines.particles.blocks import Block, has_table
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.smc import Layout, Particles
@@ -119,6 +120,8 @@ class Answers(NamedTuple):
 
     def _means(self, particles: Particles, node: CompiledNode) -> np.ndarray:
         """The same; of what is integrated out each particle's own mean."""
+        if has_table(particles, node):
+            return np.asarray(particles.tables.probabilities(node.name) @ numbers_of(node))
         inner = particles.inner
         if inner is not None and inner.has(node.name):
             return np.asarray(inner.mean_of(node))
@@ -136,6 +139,8 @@ class Answers(NamedTuple):
             shape[1 + axis] = size
         weights = now.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
         weights = np.broadcast_to(weights, numbers.shape)
+        if has_table(now, node):
+            return table_quantiles(now.tables, node.name, numbers_of(node), weights, levels)
         if now.inner is not None and now.inner.has(node.name):
             return mixture_quantiles(now.inner, node, weights, levels)
         return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
@@ -146,9 +151,12 @@ class Answers(NamedTuple):
         flat, shares = np.concatenate(columns, axis=1).astype(float), now.weights / now.total
         flat = flat - shares @ flat
         matrix = (flat * shares[:, None]).T @ flat
-        if now.inner is not None:
-            nodes = [self.model[name] for name in names]
+        nodes = [self.model[name] for name in names]
+        if now.inner is not None and any(now.inner.has(name) for name in names):
             matrix += covariance_within(now.inner, nodes, shares)
+        if now.tables is not None:
+            numbers = {n.name: numbers_of(n) for n in nodes if has_table(now, n)}
+            matrix += table_covariance(now.tables, nodes, numbers, shares)
         return matrix[0, 0] if matrix.size == 1 else matrix
 
 

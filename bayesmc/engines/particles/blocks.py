@@ -103,6 +103,12 @@ class Block:
         size, codes = node.domain.size, self.rows(node)
         if codes is None:
             return None
+        tables = self.state_rows(node)
+        if tables is not None:
+            flat = tables.reshape(*codes.shape[:2], -1, self.particles)
+            found = self.weighted(flat).reshape(tables.shape[:-1])
+            self._kept[key] = found
+            return found
         lanes = math.prod(codes.shape[:-1])
         if lanes > 1:
             codes = codes.astype(np.intp) + size * np.arange(lanes).reshape(*codes.shape[:-1], 1)
@@ -111,6 +117,18 @@ class Block:
         found = counts.reshape(*codes.shape[:-1], size) / self.total[:, :, None, None]
         self._kept[key] = found
         return found
+
+    def state_rows(self, node: CompiledNode) -> np.ndarray | None:
+        """What each particle's table says: ``(slices, elements, numbers, states, particles)``, or None."""
+        if not has_table(self.slices[0], node):
+            return None
+        key = ("tables", node.name)
+        if key not in self._kept:
+            values = [p.tables.probabilities(node.name) for p in self.slices]
+            rows = self.turned(values, self._axes(node), f"tables of {node.name}")
+            size = values[0].shape[-1]
+            self._kept[key] = rows.reshape(*rows.shape[:2], -1, size, self.particles)
+        return self._kept[key]
 
     def table(self, node: CompiledNode) -> np.ndarray:
         """The same, shape ``(slices, *plates, states)``, also where particles agree."""
@@ -244,6 +262,11 @@ def alike(one: Particles, other: Particles) -> bool:
         if own.ndim != other.values[name].ndim:
             return False
     return other.rejuvenated is False
+
+
+def has_table(particles: Particles, node: CompiledNode) -> bool:
+    """Whether each particle has a table of a node's states."""
+    return particles.tables is not None and particles.tables.has(node.name)
 
 
 class Figures(NamedTuple):

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.blocks import Block, has_table
 from bayesmc.engines.particles.families import OLD, YOUNG, Families
 from bayesmc.engines.particles.genealogy import family_sums
 from bayesmc.network import CompiledNode
@@ -125,7 +125,11 @@ def node_errors(by: Variances, block: Block, node: CompiledNode) -> np.ndarray:
         by.missed(found, moments.mean if node.angles is None else None, by.at_scouts(node))
     else:
         off, shares, step = _of_states(block, node)
-        found = np.maximum(by.variances(off), step**2 * _unseen(shares, by.worth))
+        found = by.variances(off)
+        if not has_table(
+            block.slices[0], node
+        ):  # what no particle has met has its share of a table
+            found = np.maximum(found, step**2 * _unseen(shares, by.worth))
         by.missed(found, shares, by.at_scouts(node), step)
     return block.unturned(np.sqrt(found), node, more)
 
@@ -174,12 +178,14 @@ def _of_states(block: Block, node: CompiledNode) -> tuple[np.ndarray, np.ndarray
     assert node.domain is not None
     codes, shares = block.rows(node), block.state_shares(node)
     assert codes is not None and shares is not None
+    tables = block.state_rows(node)
     if node.domain.labels is None:
         numbers = np.asarray(node.domain.numbers, dtype=float)
-        off = numbers[codes] - (shares @ numbers)[..., None]
+        own = numbers[codes] if tables is None else np.tensordot(tables, numbers, (3, 0))
+        off = own - (shares @ numbers)[..., None]
         return off, shares.max(axis=-1), float(steps(node, None, False))
-    hits = codes[:, :, :, None] == np.arange(node.domain.size)[:, None]
-    off = hits - shares[..., None]
+    each = codes[:, :, :, None] == np.arange(node.domain.size)[:, None]
+    off = (each if tables is None else tables) - shares[..., None]
     lanes = off.shape[2] * off.shape[3]
     return off.reshape(*off.shape[:2], lanes, -1), shares.reshape(*shares.shape[:2], lanes), 1.0
 

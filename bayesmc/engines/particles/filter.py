@@ -114,11 +114,10 @@ class ParticleFilter(FilterEngine):
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
     marginalize : "auto", sequence of str, or None
         Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
-        given the sampled ones, each particle with a Kalman filter of its own, all in one array operation, and
-        weighted by the density of the row given these. ``"auto"``: all that can be, names: those; ``explain``
-        says which. Means of named ones need not be affine: they are made linear at each particle's own mean
-        (extended Kalman filters), so answers and evidence are approximations of unknown error then. With
-        ``proposal="optimal"`` finite sampled nodes are drawn given the row. ``particles`` are draws.
+        given the sampled ones, each particle with a Kalman filter, and finite ones, each with a table (or one
+        for each element of a plate); the density of the row given these weighs. ``"auto"``: what can be,
+        names: those; ``explain`` says which. Means of named ones that are not affine are made linear at each
+        particle's own mean: answers and evidence are approximations then. ``particles`` are draws.
     delay : int, optional
         How many rows answers look ahead: those for slice t are given the rows up to t + delay (at the end
         what there is), by the weights of slice t + delay on the ancestors in t; beliefs about what is
@@ -247,7 +246,9 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if (why := not_delayed(self.delay, asked)) is not None:
+        if why := not_delayed(self.delay, asked) or marginal.not_of_the_past(
+            self, problem, asked.what
+        ):
             return why
         sums = marginal.endless_sums(self, problem) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
@@ -263,9 +264,8 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static, seen=problem.seen)
-        if step.integrated:
-            return marginal.effort_told(self, problem)
-        return told(step, problem, self.compiled)
+        own = marginal.effort_told(self, problem) if step.integrated else ""
+        return own or told(step, problem, self.compiled)
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
         if asked.what != "filter":
@@ -315,12 +315,12 @@ class ParticleFilter(FilterEngine):
             what = "or None for as many as there are particles, 1,000 at most"
             check_count("trajectories", trajectories, what, "smooth")
         check_choice("backward", backward, "rejection", "exact", "smooth")
-        why = self.unable(problem, Asked("smooth" if lag is None else "fixed-lag"))
-        if why is not None:
+        if why := self.unable(problem, Asked("smooth" if lag is None else "fixed-lag")):
             raise UnsupportedError(why)
-        if not self._integrates(problem):
+        own: ParticleFilter = marginal.without_tables(self, "smooth")
+        if not own._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
-        sized = self._sized(self._enough(problem, seed, lag is None, progress))
+        sized = own._sized(own._enough(problem, seed, lag is None, progress))
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, False, queries or {}, progress)
         else:

@@ -61,6 +61,8 @@ class Particles(NamedTuple):
         Particles that recovery let begin anew.
     inner : Gaussians or None
         Beliefs about what is integrated out.
+    tables : Tables or None
+        Beliefs about finite nodes that are.
     """
 
     t: int
@@ -77,6 +79,7 @@ class Particles(NamedTuple):
     averages: Averages | None = None
     injected: int = 0
     inner: Any = None
+    tables: Any = None
 
 
 class Selection(NamedTuple):
