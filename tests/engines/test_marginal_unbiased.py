@@ -34,8 +34,8 @@ FAULTS = {
     "finite nodes drawn given the row are not weighed by p/q": (
         Edit(
             STEP + "_taken",
-            "log + own, made.chosen(at)",
-            "log + made.log.mean(axis=1), made.chosen(at)",
+            "log + own, after._replace(",
+            "log + made.log.mean(axis=1), after._replace(",
         ),
         "optimal",
     ),

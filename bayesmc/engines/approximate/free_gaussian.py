@@ -12,7 +12,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy import linalg, special
+import scipy
+from scipy import special
 
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.distributions.transforms import Bounded, Identity, Transform, Wrapped
@@ -152,7 +153,7 @@ class FreeGaussian:
             raise UnsupportedError(
                 "this approximation was unpickled, and pickles carry no functions"
             )
-        away = linalg.solve_triangular(self.root, z.T, lower=True, trans="T").T
+        away = scipy.linalg.solve_triangular(self.root, z.T, lower=True, trans="T").T
         u = self.center + away
         log = log + np.log(np.diag(self.root)).sum()
         with np.errstate(all="ignore"):
@@ -176,14 +177,14 @@ class FreeGaussian:
         if any(part is None for part in parts) or self.density is None:
             return None
         gains = np.concatenate([part[1] for part in parts if part is not None])
-        scaled = linalg.solve_triangular(self.root, gains.T, lower=True)
+        scaled = scipy.linalg.solve_triangular(self.root, gains.T, lower=True)
         return scaled.T @ scaled
 
     @cached_property
     def sds(self) -> np.ndarray:
         """Standard deviations of the free numbers."""
         size = len(self.center)
-        inverse = linalg.solve_triangular(self.root, np.eye(size), lower=True)
+        inverse = scipy.linalg.solve_triangular(self.root, np.eye(size), lower=True)
         return np.sqrt(np.square(inverse).sum(axis=0))
 
     # ---- private -------------------------------------------------------------------------------
@@ -208,7 +209,9 @@ class FreeGaussian:
         if node is not None and (gains.sum(axis=1) <= 1.0).all() and node.size == len(gains):
             var = np.square(self.sds[node.start : node.start + node.size])
         else:
-            var = np.square(linalg.solve_triangular(self.root, gains.T, lower=True)).sum(axis=0)
+            var = np.square(scipy.linalg.solve_triangular(self.root, gains.T, lower=True)).sum(
+                axis=0
+            )
         return NormalMarginal(mean.reshape(shape), var.reshape(shape))
 
     def _of_bounded(self, node: FreeNode, transform: Transform) -> Marginal | None:

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.structure.curvature import Curvature, Curved
@@ -275,14 +275,14 @@ class _Scaled:
         self.root: np.ndarray | None = None
         self.values: np.ndarray | None = None
         try:
-            factor = linalg.cholesky(matrix, lower=True, check_finite=False)
-        except linalg.LinAlgError:
+            factor = scipy.linalg.cholesky(matrix, lower=True, check_finite=False)
+        except scipy.linalg.LinAlgError:
             factor = None
         clear = (
             1e3 * self.floor * size
         )  # the least pivot bounds the least eigenvalue from above alone
         if factor is None or float(np.diag(factor).min(initial=1.0)) ** 2 <= clear:
-            self.values, self.vectors = linalg.eigh(matrix, check_finite=False)
+            self.values, self.vectors = scipy.linalg.eigh(matrix, check_finite=False)
             if factor is None or self.values.min(initial=1.0) <= self.floor:
                 return
         self.factor = factor
@@ -292,7 +292,7 @@ class _Scaled:
         """Newton's, uphill whatever the signs of the curvature."""
         inner = slope * self.unit
         if self.root is not None:
-            return self.unit * linalg.cho_solve((self.factor, True), inner)
+            return self.unit * scipy.linalg.cho_solve((self.factor, True), inner)
         assert self.values is not None
         size = np.maximum(np.abs(self.values), 1e-8)
         return self.unit * (self.vectors @ ((self.vectors.T @ inner) / size))

@@ -47,6 +47,16 @@ class PosteriorMode:
         Hidden nodes on which nothing observed depends.
     modes : int
         How many modes the climbs found; this is the highest.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.Gamma(3.0, 1.0))
+    >>> net.add("count", lambda rate: bmc.Poisson(rate))
+    >>> mode = bmc.map(net, {"count": 4})
+    >>> mode["rate"].round(4).item(), mode.modes  # (3 + 4 - 1) / 2
+    (3.0, 1)
     """
 
     values: dict[str, np.ndarray]

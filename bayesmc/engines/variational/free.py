@@ -17,7 +17,8 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy import optimize, special
+import scipy
+from scipy import special
 
 from bayesmc.engines.variational.factors import Factor, State
 from bayesmc.expression import Expression, Leaf, Program, leaf, pick
@@ -107,7 +108,7 @@ class FreeFactor(Factor):
             if self._lost(self._origin(), state)[0] < _LOST:
                 break
             self.root = 0.1 * self.root
-        best = optimize.minimize(
+        best = scipy.optimize.minimize(
             self._lost, self._origin(), args=(state,), jac=True, method="L-BFGS-B",
             options={"maxiter": self.steps, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-10},
         )  # fmt: skip
