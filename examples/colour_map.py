@@ -3,9 +3,9 @@
 Every cell of a corridor, or of a hall, is light or dark. A robot sweeps it on command, does not always move
 when it is told to, and sees the colour of the cell that it is on, sometimes wrongly. Where it is and what the
 map is hang together: an exact filter needs a probability for each pair of a place and a map, 2,048 in a
-corridor of 8 cells, and more than there are atoms on earth in a hall of 64. Given the way of the robot the
-cells have nothing to do with each other. So particles draw the place, and each carries a table of two numbers
-for every cell, of which a reading touches one.
+corridor of 8 cells, and 10^21 in a hall of 64. Given the way of the robot the cells have nothing to do with
+each other. So particles draw the place, and each carries a table of two numbers for every cell, of which a
+reading touches one.
 
 Murphy (2000), Bayesian map learning in dynamic environments, NIPS 12; Doucet, de Freitas, Murphy and Russell
 (2000), Rao-Blackwellised particle filtering for dynamic Bayesian networks, UAI 16.

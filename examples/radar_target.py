@@ -5,15 +5,15 @@
     range_t ~ N(|position_t|, .1),    bearing_t ~ WrappedNormal(atan2(position_t), .01),
     doppler_t ~ N(speed_t . position_t / |position_t|, .02)         where the radar has it
 
-Six who answer, and what each of them approximates:
+Who answers, and what each of them approximates:
 
 - ``SwitchingKalmanFilter`` (GPB1, IMM, GPB2) keeps one Gaussian for each mode, whose readings are made linear
   where it stands (``linearize=True``), and merges; its smoother is Kim's;
-- ``ExpectationPropagation``, with hindsight, passes messages between these Gaussians until they agree;
+- ``ExpectationPropagation``, smoothed, passes messages between these Gaussians until they agree;
 - an extended Kalman filter takes the target to fly straight on, pushed about by more noise;
-- marginalised particles draw modes, and each has a Kalman filter. For that the readings of a scan are
-  converted to a position with the covariance that a reading there has (Lerro and Bar-Shalom), which is the
-  approximation; Doppler is left out;
+- marginalised particles draw modes, and each has a Kalman filter. Its readings could be linearised by name, as
+  above; here those of a scan are converted to a position with the covariance that a reading there has (Lerro
+  and Bar-Shalom), which is the approximation; Doppler is left out;
 - particles that draw everything approximate nothing but by chance.
 
 The bearing is an angle: the target crosses the west, where it jumps by a full turn, and innovations count
@@ -170,8 +170,8 @@ def engines(particles: int, doppler: bool, sweeps: int = SWEEPS) -> dict[str, tu
         radar(target(False), doppler),
         bmc.ExtendedKalmanFilter(),
     )
-    found["GPB2 and Kim, hindsight"] = bmc.smooth, seen, rules["gpb2"]
-    found["EP, hindsight"] = (
+    found["GPB2 and Kim, smoothed"] = bmc.smooth, seen, rules["gpb2"]
+    found["EP, smoothed"] = (
         bmc.smooth,
         seen,
         bmc.ExpectationPropagation(sweeps, tolerance=1e-3, linearize=True),
@@ -238,14 +238,14 @@ def report(found: dict[str, Score], runs: int, what: str) -> None:
 
 
 def draw(seed: int, particles: int, sweeps: int = SWEEPS) -> Any:
-    """One flight: its path, and its modes, filtered and with hindsight."""
+    """One flight: its path, and its modes, filtered and smoothed."""
     truth, seen = simulated(seed)
     asked = engines(particles, False, sweeps)
     marginalised = next(name for name in asked if "marginalised" in name)
-    shown = {"GPB2": picture.DRAWS, marginalised: picture.FAINT, "EP, hindsight": picture.OTHER}
+    shown = {"GPB2": picture.DRAWS, marginalised: picture.FAINT, "EP, smoothed": picture.OTHER}
     beliefs = {name: answered(asked[name], truth, seen, seed)[0] for name in shown}
     figure, panels = picture.axes(
-        [["path", "GPB2"], ["path", marginalised], ["miss", "EP, hindsight"]], (12, 8.5),
+        [["path", "GPB2"], ["path", marginalised], ["miss", "EP, smoothed"]], (12, 8.5),
         height_ratios=[1, 1, 1],
     )  # fmt: skip
     ax, scans = panels["path"], np.arange(SCANS)
@@ -269,7 +269,7 @@ def draw(seed: int, particles: int, sweeps: int = SWEEPS) -> Any:
             here = truth["mode"] == k
             ax.plot(scans[here], np.full(here.sum(), 1.06), "s", ms=4, color=colour, clip_on=False)
         ax.set(xlim=(0, SCANS - 1), ylim=(0, 1.1), ylabel="probability", title=f"modes: {name}")
-    panels["EP, hindsight"].set(xlabel="scan (squares above: what was)")
+    panels["EP, smoothed"].set(xlabel="scan (squares above: what was)")
     panels["GPB2"].legend(loc="lower right", fontsize=9)
     return figure
 

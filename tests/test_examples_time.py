@@ -162,8 +162,8 @@ def test_a_target_is_lost_least_where_modes_are_followed() -> None:
     assert found["GPB2"].miss < 1.1 * found["2000 particles"].miss
     assert abs(found["GPB2"].miss / found["200 marginalised, converted"].miss - 1.0) < 0.1
     assert abs(found["GPB2"].log - found["200 marginalised, converted"].log) < 1.5  # of some 335
-    assert found["EP, hindsight"].miss < 0.75 * found["GPB2"].miss
-    assert found["EP, hindsight"].right > found["GPB2"].right + 0.05
+    assert found["EP, smoothed"].miss < 0.75 * found["GPB2"].miss
+    assert found["EP, smoothed"].right > found["GPB2"].right + 0.05
     logs = [found[name].log for name in ("GPB2", "IMM", "GPB1", "EKF, straight on")]
     assert logs == sorted(logs, reverse=True)
 

@@ -305,7 +305,8 @@ class _Search:
                 self.why.setdefault(name, reason)
         for name in given_up - direct:
             by = next((n for n in self.slices.dynamic if n in direct), None)
-            self.why.setdefault(name, f"{by!r}, which is sampled, depends on it")
+            what = "sampled" if by is None or self._is_number(by) else "no number"
+            self.why.setdefault(name, f"{by!r}, which is {what}, depends on it")
         return inner - given_up
 
     def _given_up(self, inner: set[str], name: str) -> tuple[str, ...]:

@@ -126,9 +126,10 @@ class ParticleBelief(OnlineBelief):
         """
         count = len(self.window)
         if slices not in range(count):
+            has = f"for the last {count} slices, 0 to {count - 1} back" if count else "for none yet"
             raise QueryError(
-                f"back({slices!r}): it answers for the last {count} slices, 0 to {count - 1} back; "
-                "for more give ParticleFilter(delay=...)"
+                f"back({slices!r}): it answers {has}; ParticleFilter(delay=k) keeps the last k slices beside "
+                "the newest, as rows come in"
             )
         found = copy.copy(self.__dict__)
         found.pop("_particles", None)

@@ -82,7 +82,6 @@ class ParticleFilter(FilterEngine):
     ess_threshold : float
         Particles are resampled on the way into a slice where they are worth less than this share of their
         number: 1 resamples (nearly) always, 0 never (sequential importance sampling).
-
     proposal : dict, optional
         Node, or tuple of nodes drawn jointly -> a function whose arguments are the slice before
         (``x_prev``), observed nodes of the slice, inputs, ``t`` or nodes drawn before, and which returns the
@@ -113,11 +112,12 @@ class ParticleFilter(FilterEngine):
     recovery : Recovery, optional
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
     marginalize : "auto", sequence of str, or None
-        Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones that are linear
-        given the sampled ones, each particle with a Kalman filter, and finite ones, each with a table (or one
-        for each element of a plate); the density of the row given these weighs. ``"auto"``: what can be,
-        names: those; ``explain`` says which. Means of named ones that are not affine are made linear at each
-        particle's own mean: answers and evidence are approximations then. ``particles`` are draws.
+        Hidden nodes that are integrated out (Rao-Blackwellised): Normal and MvNormal ones, linear given the
+        sampled ones, by a Kalman filter for each particle, finite ones by a table (or one for each element of
+        a plate). ``"auto"``: what can be, names: those; ``explain`` says which. Nonlinear means of named ones
+        are linearised at each particle's own mean: answers and evidence are approximations then.
+        ``proposal="optimal"`` draws the sampled nodes, which must be finite, from p(s_t | s_{t-1}, y_t) (the
+        mixture Kalman filter). Tables answer ``filter`` and ``forecast`` alone.
     delay : int, optional
         How many rows answers look ahead: those for slice t are given the rows up to t + delay (at the end
         what there is), by the weights of slice t + delay on the ancestors in t; beliefs about what is
@@ -269,7 +269,7 @@ class ParticleFilter(FilterEngine):
 
     def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
         if asked.what != "filter":
-            return ahead_told(self.delay, marginal.back(self, problem, asked))
+            return marginal.back(self, problem, asked)
         return ahead_told(self.delay, self.effort(problem))
 
     def filter(
