@@ -571,3 +571,25 @@ def test_switched_lines_have_their_own_directions() -> None:
     long = bmc.infer(net, {"y": y}, engine=bmc.Gibbs(draws=1500, warmup=300, chains=4), rng=0)
     off = np.abs(posterior.mean("level") - long.mean("level")) / long.std("level")
     assert off.max() < 0.2
+
+
+# ---- nodes that are partly observed -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("engine", [EP(), bmc.AssumedDensity()])
+def test_check_keeps_what_was_seen_of_finite_plates(engine: Any) -> None:
+    """Means within five standard errors: false alarms below one in a million; states are exact."""
+    net = bmc.BayesNet("labels, some seen", plates={"i": 4})
+    net.add("m", bmc.Normal(0.0, 2.0))
+    net.add("z", bmc.Bernoulli(0.5), plates="i")
+    net.add("y", lambda m, z: bmc.Normal(m + 2.0 * z, 1.0), plates="i")
+    evidence = {"y": [1.0, 1.2, 0.8, 1.1], "z": [0, 0, None, 0]}
+    right = bmc.infer(net, evidence, engine=bmc.Exact())
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the shape of tails
+        check = bmc.infer(net, evidence, engine=engine).check(rng=0)
+    found = check.posterior
+    assert abs(found.mean("m") - right.mean("m")) < 5 * found.mcse("m")
+    assert found.mean("z")[[0, 1, 3]].tolist() == [0.0, 0.0, 0.0]
+    off = found.log_marginal_likelihood - right.log_marginal_likelihood
+    assert abs(off) < 5 * found.log_marginal_likelihood_mcse < 0.1

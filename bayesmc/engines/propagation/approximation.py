@@ -81,6 +81,12 @@ class Messages:
         self.names = system.target.chain
         self._beliefs, self._numbers, self._places = system.beliefs, system.numbers, system.places
         self._kept = system.kept
+        #: where elements of finite nodes are observed, flat
+        self._seen = {
+            n: np.flatnonzero(o.mask)
+            for n, o in system.target.observed.items()
+            if n in self.names and o.mask is not None
+        }
 
     def draw(self, rng: np.random.Generator, draws: int) -> Drawn:
         """Independent joint draws of all nodes in ``names``."""
@@ -183,6 +189,8 @@ class Messages:
                 assert node.domain is not None
                 table = normalised(self._logs(name))
                 even = np.logaddexp(table + np.log(1 - _EVEN), np.log(_EVEN / node.domain.size))
+                if name in self._seen:  # what was seen is never drawn anew
+                    even[self._seen[name]] = table[self._seen[name]]
                 chosen = np.where(is_wide[:, None, None], even, table)
                 codes = (chosen + rng.gumbel(size=(draws, *table.shape))).argmax(axis=-1)
                 own, wide = (
