@@ -102,7 +102,8 @@ def _assembled(problem: Problem, target: Target, who: str, mapped: Collection[st
     chain = [model[n] for n in target.chain]
     hidden = {n.name for n in chain if n.domain is None}
     finite = _finite(model, target, hidden)
-    own = OwnFamilies(model, target, known, finite, observed, mapped)
+    given = {**known, **_filled(target)}
+    own = OwnFamilies(model, target, given, finite, observed, mapped)
     free = [n for n in chain if n.name in hidden and n.name not in own.nodes]
     numbers = numbers_of(model, free, observed)
     states = {
@@ -112,7 +113,7 @@ def _assembled(problem: Problem, target: Target, who: str, mapped: Collection[st
         for e in np.flatnonzero(o.mask)
     }
     parts: list[Rows | Read] = []
-    terms = Terms(model, known, numbers, finite)
+    terms = Terms(model, given, numbers, finite)
     tabled: set[str] = set()
     for name in target.terms:
         if name in own.nodes or name in own.factors:
@@ -141,6 +142,26 @@ def _assembled(problem: Problem, target: Target, who: str, mapped: Collection[st
         parts.append(terms.read(name, elements))
     tables = _tables(problem, target, tabled, finite, states, who)
     return Assembly(problem, target, numbers, parts, tables, states, own).system()
+
+
+def _filled(target: Target) -> dict[str, np.ndarray]:
+    """Partly observed nodes whose missing elements no term reads, with what stands there for shape alone.
+
+    Factors are read of their seen elements; the others are drawn afterwards.
+    """
+    found = {}
+    for name, seen in target.observed.items():
+        if (
+            seen.mask is None
+            or name in target.chain
+            or name not in target.terms
+            or not seen.mask.any()
+        ):
+            continue
+        value = np.array(seen.value)
+        value[~seen.mask] = value[seen.mask][0]
+        found[name] = value
+    return found
 
 
 def _is_tabled(target: Target, name: str) -> bool:
