@@ -30,6 +30,8 @@ _REACH = 42.0
 _MOVES = 12
 #: spacing and half-width of lattices, in standard deviations, by dimension
 _LATTICE = {2: (0.4, 7.2), 3: (0.55, 6.6)}
+#: spreads below this share of the spacing are the lattice's, not the product's
+_FLOOR = 0.7
 #: points of importance sampling, and how much wider than the belief they lie, in variances
 _POINTS, _WIDER = 4096, 1.6
 #: relative error of importance sampling with which it says nothing
@@ -123,12 +125,15 @@ def on_lattice(
     axis = np.arange(-round(reach / step), round(reach / step) + 1) * step
     grid = np.stack(np.meshgrid(*[axis] * k, indexing="ij"), axis=-1).reshape(-1, k)
     coarse = (np.round(np.abs(grid) / step).astype(int) % 2 == 0).all(axis=-1)
+    # parameters that over- or underflow far out have density zero there, as models have it
+    far = (np.abs(grid).max(axis=-1) > 0.6 * reach).reshape(-1, *(1,) * (mean.ndim - 1))
     shape = (len(grid),) + (1,) * (mean.ndim - 1) + (k,)
     for turn in range(_MOVES):
         root, _ = try_cholesky(cov)
         widen = 1.0 if turn else 1.3
         u = mean + np.matvec(widen * root, grid.reshape(shape))
         log = log_factor(u) + np.vecdot(linear, u) - 0.5 * np.vecdot(u, np.matvec(precision, u))
+        log = np.where(np.isnan(log) & far, -np.inf, log)
         scale = np.log(root.diagonal(0, -2, -1)).sum(axis=-1) + k * np.log(widen * step)
         fine = _summed(u, log, np.broadcast_to(scale, log.shape))
         rough = _summed(
@@ -138,8 +143,11 @@ def on_lattice(
         bent = np.abs(fine.cov / np.where(cov == 0, 1.0, cov) - 1.0).max(axis=(-2, -1))
         done = np.isnan(fine.log) | ((moved.max(axis=-1) < 0.3) & (bent < 0.5))
         good = np.isfinite(fine.log)
+        coarsest = (_FLOOR * widen * step) ** 2
+        held, grew = _held_wide(fine.cov, root, coarsest, good)
+        done &= ~grew
         mean = np.where(good[..., None], fine.mean, mean)
-        cov = np.where(good[..., None, None], fine.cov, cov)
+        cov = np.where(good[..., None, None], held, cov)
         if done.all() and turn:
             break
     return fine._replace(error=_difference(fine, rough))
@@ -288,6 +296,21 @@ def _even_normals(k: int) -> np.ndarray:
         ratio = (1.0 + ratio) ** (1.0 / (k + 1))
     steps = ratio ** -np.arange(1.0, k + 1)
     return special.ndtri((0.5 + np.arange(1, _POINTS + 1)[:, None] * steps) % 1.0)
+
+
+def _held_wide(
+    cov: np.ndarray, root: np.ndarray, least: float, good: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Covariances that are no narrower than a lattice of some spacing can tell, and which were."""
+    inner = np.linalg.solve(root, np.matrix_transpose(np.linalg.solve(root, cov)))
+    inner = np.where(good[..., None, None], inner, np.eye(cov.shape[-1]))
+    sizes, axes = np.linalg.eigh(0.5 * (inner + np.matrix_transpose(inner)))
+    narrow = (sizes < least).any(axis=-1)
+    if not narrow.any():
+        return cov, narrow
+    turned = root @ axes
+    wide = (turned * np.maximum(sizes, least)[..., None, :]) @ np.matrix_transpose(turned)
+    return np.where(narrow[..., None, None], wide, cov), narrow
 
 
 def _difference(fine: Tilt, rough: Tilt) -> float:

@@ -18,6 +18,8 @@ from bayesmc.gaussian import try_cholesky
 
 #: a cavity or message this small, beside what it is a difference of, is rounding
 _ROUNDING = 1e-13
+#: errors of quadrature above this are rough, and the share of the way that is gone with them at most
+_ROUGH, _CAUTIOUS = 0.1, 0.1
 
 
 class Kernel(Protocol):
@@ -136,6 +138,8 @@ class Batch:
         fine = np.isfinite(found.log) & (found.log > self.floor)
         self.error = max(self.error, found.error)
         skipped = int((~fine).sum())
+        if members is None:
+            share = cautious(share, found.error)
         self._send_tables(beliefs, at, found, fine, share if self.k else _whole(share))
         if self.k:
             skipped += self._moved(beliefs, at, found, fine, share)
@@ -339,6 +343,14 @@ class Found(NamedTuple):
     mean: np.ndarray
     cov: np.ndarray
     error: float
+
+
+def cautious(share: float, error: float) -> float:
+    """How far messages of rough moments move beliefs: many of them together would overshoot.
+
+    Where beliefs come near, rules that were too coarse for vague ones get fine.
+    """
+    return min(share, _CAUTIOUS) if error > _ROUGH else share
 
 
 def _is_definite(matrices: np.ndarray) -> np.ndarray:

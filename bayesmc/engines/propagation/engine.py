@@ -146,6 +146,8 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
             if end.open
             else ""
         )
+        if end.silent:
+            return f"ExpectationPropagation: {_unsaid(end)}; take HamiltonianMonteCarlo or Gibbs"
         return (
             f"ExpectationPropagation: messages have not settled after {end.sweeps} sweeps: the last one "
             f"changed a belief by {end.change:.2g} (tolerance {float(self.tolerance):.2g}){out}. Give more "
@@ -201,7 +203,17 @@ class AssumedDensity(MessageEngine):
     def doubt(self, end: Settled) -> str | None:
         if not end.open:
             return None
+        if end.silent:
+            return f"AssumedDensity: {_unsaid(end)}; take ExpectationPropagation or Gibbs"
         return (
             f"AssumedDensity: {end.open} factors have no integral with the belief so far and were left out; "
             "take ExpectationPropagation or Gibbs"
         )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _unsaid(end: Settled) -> str:
+    parts = [f"{n} factors of node {name!r}" for name, n in end.silent.items()]
+    return f"no message could be made for {', '.join(parts)}; answers are those of the prior there"

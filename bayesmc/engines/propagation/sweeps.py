@@ -7,11 +7,12 @@ Assumed-density filtering visits one factor after the other, once, in the order 
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from bayesmc.engines.propagation.batch import Batch, cautious
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs
 from bayesmc.engines.propagation.system import System
 from bayesmc.errors import ZeroProbabilityError
@@ -36,13 +37,15 @@ class Settled:
     skipped, open : int
         Improper messages left out, in all sweeps and in the last.
     log_total : float
-        Approximate log evidence; NaN where some factor has no integral with its cavity.
+        Approximate log evidence; NaN where some factor has no integral with its cavity, or was left out.
     error : float
         Of quadrature and importance sampling, the worst: what coarser rules differ by.
     share : float
         The share of the way that beliefs moved in the end.
     log_as_met : float or None
         Of one pass: the sum of the logs of factors' integrals with the belief that each of them met.
+    silent : dict
+        Node or potential -> number of its factors that were left out to the end and never sent a message.
     """
 
     converged: bool
@@ -54,6 +57,7 @@ class Settled:
     error: float
     share: float
     log_as_met: float | None = None
+    silent: Mapping[str, int] = field(default_factory=dict)
 
 
 def settle(
@@ -69,30 +73,38 @@ def settle(
     order = [*batches, *reversed(batches[:-1])] if len(batches) > 1 else batches
     share, skipped, left, change, done = 1.0 - damping, 0, 0, np.inf, 0
     history: list[float] = []
+    skips: list[tuple[Batch, int]] = []
+    step = share
     if not any(b.count for b in batches):
         _refresh(beliefs)
         return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, share)
     while done < sweeps:
         before = _marginals(beliefs)
-        left = 0
         for batch in batches:
             batch.error = 0.0
-        for batch in order:
-            left += batch.visit(beliefs, share).skipped
+        skips = [(batch, batch.visit(beliefs, share).skipped) for batch in order]
+        left = sum(n for _, n in skips)
         change = _distance(before, _marginals(beliefs))
         done, skipped = done + 1, skipped + left
         if advance is not None:
             advance()
         # a share of the way leaves the rest of it: what is ahead is judged, not the step
-        if change <= tolerance * share:
-            break
+        step = cautious(share, max(b.error for b in batches))
+        if change <= tolerance * step:
+            # beliefs that rest while messages are open have not settled: shorter moves may yet be proper
+            if not left or (change == 0.0 and share <= _LEAST):
+                break
+            share, history = max(share * _SHARE, _LEAST), []
+            continue
         history.append(change)
         if len(history) > _PATIENCE and change > _SHRUNK * history[-1 - _PATIENCE]:
             share, history = max(share * _SHARE, _LEAST), []
     _refuse_impossible(system)
     error = max((b.error for b in batches), default=0.0)
-    settled = bool(change <= tolerance * share and not left)
-    return Settled(settled, done, float(change), skipped, left, _evidence(system), error, share)
+    settled = bool(change <= tolerance * step and not left)
+    total = np.nan if left and not settled else _evidence(system)
+    silent = _silent([b for b, n in skips if n]) if left else {}
+    return Settled(settled, done, float(change), skipped, left, total, error, share, silent=silent)
 
 
 def pass_once(system: System) -> Settled:
@@ -103,12 +115,26 @@ def pass_once(system: System) -> Settled:
             skipped += batch.visit(beliefs, 1.0, np.array([k])).skipped
     _refuse_impossible(system, at_all=True)
     met = system.log_scale + beliefs.log_total + sum(float(b.logs.sum()) for b in system.batches)
-    total = _evidence(system)
+    total = np.nan if skipped else _evidence(system)
     error = max((b.error for b in system.batches), default=0.0)
-    return Settled(not skipped, 1, 0.0, skipped, skipped, total, error, 1.0, met)
+    silent = _silent(system.batches) if skipped else {}
+    return Settled(not skipped, 1, 0.0, skipped, skipped, total, error, 1.0, met, silent)
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _silent(batches: Sequence[Batch]) -> dict[str, int]:
+    """How many factors have never sent a message, by node."""
+    found: dict[str, int] = {}
+    for batch in dict.fromkeys(batches):
+        if not batch.k or batch.is_prior:
+            continue
+        sent = batch.precision.any(axis=(-2, -1)) | batch.linear.any(axis=-1)
+        count = int((~sent).sum())
+        if count:
+            found[batch.name] = found.get(batch.name, 0) + count
+    return found
 
 
 def _refresh(beliefs: Beliefs) -> None:
