@@ -305,7 +305,7 @@ def _held_wide(
     inner = np.linalg.solve(root, np.matrix_transpose(np.linalg.solve(root, cov)))
     inner = np.where(good[..., None, None], inner, np.eye(cov.shape[-1]))
     sizes, axes = np.linalg.eigh(0.5 * (inner + np.matrix_transpose(inner)))
-    narrow = (sizes < least).any(axis=-1)
+    narrow = np.asarray((sizes < least).any(axis=-1))
     if not narrow.any():
         return cov, narrow
     turned = root @ axes

@@ -635,3 +635,85 @@ def test_a_missing_outcome_changes_nothing_but_what_is_drawn_for_it() -> None:
         assert some.log_marginal_likelihood == pytest.approx(evidence, abs=0.02)
         ahead = (weight * inverse(w)).sum()
         assert some.mean("y")[2] == pytest.approx(ahead, abs=0.1)
+
+
+# ---- vague priors -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("m", "s", "n"),
+    [
+        (bmc.Normal(0.0, 100.0), bmc.HalfNormal(5.0), 10),
+        (bmc.Normal(0.0, 10.0), bmc.HalfNormal(3.0), 25),
+        (bmc.Normal(0.0, 100.0), bmc.Uniform(0.0, 100.0), 25),
+        (bmc.Normal(0.0, 1000.0), bmc.HalfNormal(100.0), 40),
+    ],
+)
+def test_mean_and_scale_under_vague_priors(m: Any, s: Any, n: int) -> None:
+    """The first lattices are far too coarse; messages must neither stop there nor overshoot."""
+    y = np.random.default_rng(1).normal(2.0, 1.0, n)
+    net = bmc.BayesNet(plates={"i": n})
+    net.add("m", m)
+    net.add("s", s)
+    net.add("y", lambda m, s: bmc.Normal(m, s), plates="i")
+    found = bmc.infer(net, {"y": y}, engine=EP())
+    assert found.converged
+    scale = np.exp(np.linspace(np.log(0.2), np.log(8.0), 601))[:, None]
+    mean = np.linspace(-2.0, 6.0, 801)
+    square = ((y - y.mean()) ** 2).sum() + n * (mean - y.mean()) ** 2
+    logs = s.log_prob(scale) + m.log_prob(mean) - 0.5 * square / scale**2
+    weight = np.exp(logs - logs.max() + (1 - n) * np.log(scale / scale.mean()))
+    weight /= weight.sum()
+    for name, at in (("m", mean), ("s", scale)):
+        right = (weight * at).sum()
+        spread = np.sqrt((weight * (at - right) ** 2).sum())
+        assert found.mean(name) == pytest.approx(right, abs=0.08 * spread)
+        assert found.std(name) == pytest.approx(spread, rel=0.21)  # EP's own bias, of few readings
+    assert found.cov("s") == pytest.approx(found.var("s"), rel=1e-9)
+    both = np.diag(found.cov("m", "s"))
+    assert both == pytest.approx(np.array([found.var("m"), found.var("s")]), rel=1e-9)
+
+
+@pytest.mark.parametrize("engine", [EP(), bmc.AssumedDensity()])
+def test_factors_without_any_message_are_told(engine: Any) -> None:
+    net = bmc.BayesNet(plates={"i": 3})
+    for name in "abcd":
+        net.add(name, bmc.Normal(0.0, 100.0))
+    net.add("y", lambda a, b, c, d: bmc.Normal(a * b + c * d, 0.01), plates="i")
+    told = (
+        "no message could be made for 3 factors of node 'y'; answers are those of the prior there"
+    )
+    with pytest.warns(ConvergenceWarning, match=told):
+        found = bmc.infer(net, {"y": [3.0, 4.0, 5.0]}, engine=engine)
+    assert not found.converged and np.isnan(found.log_marginal_likelihood)
+
+
+def test_covariances_are_those_of_the_beliefs() -> None:
+    """Log-normal numbers that hang together, shares, a label: closed forms, and ``var`` on the diagonal."""
+    net = bmc.BayesNet("kinds", plates={"i": 6})
+    net.add("a", bmc.LogNormal(0.0, 0.5))
+    net.add("b", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda a, b: bmc.Normal(np.log(a) + b, 0.5), plates="i")
+    net.add("p", bmc.Dirichlet(np.array([1.0, 2.0, 3.0])))
+    net.add("k", lambda p: bmc.Categorical(p), plates="i")
+    net.add("z", bmc.Bernoulli(0.3))
+    net.add("w", lambda z: bmc.Normal(1.0 * z, 1.0))
+    rows = {"y": [0.5, 0.2, 0.7, 0.1, 0.4, 0.6], "k": [0, 1, 2, 2, 1, 2], "w": 0.8}
+    found = bmc.infer(net, rows, engine=EP(), rng=0)
+    names = ["a", "b", "p", "z"]
+    whole = found.cov(*names)
+    var = np.concatenate([np.atleast_1d(found.var(n)) for n in names])
+    assert np.diag(whole) == pytest.approx(var, rel=1e-9)
+    for name in names:
+        assert np.diag(np.atleast_2d(found.cov(name))) == pytest.approx(
+            np.atleast_1d(found.var(name)), rel=1e-9
+        )
+    precision = np.array(
+        [[4.0 + 24.0, 24.0], [24.0, 1.0 + 24.0]]
+    )  # of log a and b: linear-Gaussian
+    free = np.linalg.inv(precision)
+    assert whole[0, 1] == pytest.approx(found.mean("a") * free[0, 1], rel=1e-4)
+    alpha = np.array([2.0, 4.0, 6.0])
+    share = alpha / 12.0
+    assert whole[2:5, 2:5] == pytest.approx((np.diag(share) - np.outer(share, share)) / 13.0)
+    assert not whole[:2, 2:].any() and not whole[2:5, 5:].any()

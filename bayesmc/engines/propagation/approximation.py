@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -41,11 +43,32 @@ class Mapped:
     spread: np.ndarray
 
     @cached_property
-    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+    def _values(self) -> tuple[np.ndarray, np.ndarray]:
+        """Values at points of the rule, and their weights."""
         x, w = np.polynomial.hermite_e.hermegauss(_POINTS)
         shape = (-1, *(1,) * self.centre.ndim)
         values = self.transform.constrain(self.centre + self.spread * x.reshape(shape))
-        weight = (w / w.sum()).reshape(shape)
+        return values, (w / w.sum()).reshape(shape)
+
+    @property
+    def coefficients(self) -> np.ndarray:
+        """By normalised Hermite polynomials of the standardised free numbers, shape (points, scalars).
+
+        The polynomials are orthonormal under the rule, so that squares from the first on sum to ``var``.
+        """
+        x, _ = np.polynomial.hermite_e.hermegauss(_POINTS)
+        values, weight = self._values
+        flat = (weight * values).reshape(_POINTS, -1)
+        before, one = np.zeros(_POINTS), np.ones(_POINTS)
+        found = []
+        for k in range(_POINTS):
+            found.append(one @ flat)
+            before, one = one, (x * one - np.sqrt(k) * before) / np.sqrt(k + 1.0)
+        return np.array(found)
+
+    @cached_property
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+        values, weight = self._values
         mean = (weight * values).sum(axis=0)
         return mean, (weight * (values - mean) ** 2).sum(axis=0)
 
@@ -131,14 +154,30 @@ class Messages:
         return table.reshape(*node.plate_shape, node.domain.size)
 
     def covariance(self, *names: str) -> np.ndarray | None:
-        """Of numbers that are as they are; others by draws."""
+        """Of all scalars; None, answered by draws, where vectors or matrices are mapped as a whole.
+
+        Numbers of one set are one-to-one functions of jointly normal ones: covariances are sums over Hermite
+        coefficients (Mehler's formula), whose diagonal is ``var``. All else is independent.
+        """
         parts = [self._numbers.get(n) for n in names]
-        if any(x is None or not x.is_plain for x in parts):
-            return None
-        at = np.concatenate([x.at.reshape(-1) for x in parts if x is not None])
-        _, cov = self._beliefs.moments(np.maximum(at, 0))
-        known = at < 0
-        return np.where(known[:, None] | known, 0.0, cov)
+        for x in parts:
+            if x is not None and x.transform.unconstrained_shape != x.node.event_shape:
+                return None
+        sizes = [math.prod(self.model[n].value_shape) for n in names]
+        ends = np.cumsum([0, *sizes])
+        places = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
+        found = np.zeros((ends[-1], ends[-1]))
+        mine = [k for k, x in enumerate(parts) if x is not None]
+        if mine:
+            at = np.concatenate([places[k] for k in mine])
+            found[np.ix_(at, at)] = self._mapped_covariance([x for x in parts if x is not None])
+        for j, k in itertools.product(range(len(names)), repeat=2):
+            if names[j] == names[k] and parts[j] is None:
+                block = self._own_covariance(names[j])
+                if block is None:
+                    return None
+                found[np.ix_(places[j], places[k])] = block
+        return found
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
@@ -200,6 +239,55 @@ class Messages:
                 )
                 values[name] = codes.reshape(draws, *node.plate_shape).astype(node.domain.dtype)
         return values, own, wide
+
+    def _mapped_covariance(self, parts: Sequence[Numbers]) -> np.ndarray:
+        at = np.concatenate([x.at.reshape(-1) for x in parts])
+        _, free = self._beliefs.moments(np.maximum(at, 0))
+        known = at < 0
+        free = np.where(known[:, None] | known, 0.0, free)
+        if all(x.is_plain for x in parts):
+            return free
+        spread = np.sqrt(free.diagonal())
+        scale = np.where(spread > 0, spread, 1.0)
+        correlation = np.clip(free / scale / scale[:, None], -1.0, 1.0)
+        series = []
+        for x in parts:
+            own = self.marginal(x.node.name)
+            if isinstance(own, Mapped):
+                series.append(own.coefficients)
+            else:
+                plain = np.zeros((_POINTS, x.at.size))
+                plain[1] = np.sqrt(np.asarray(own.var)).reshape(-1)  # type: ignore[union-attr]
+                series.append(plain)
+        coefficients = np.concatenate(series, axis=1)
+        found, power = np.zeros_like(free), np.ones_like(free)
+        for one in coefficients[1:]:
+            power = power * correlation
+            found += power * one * one[:, None]
+        return found
+
+    def _own_covariance(self, name: str) -> np.ndarray | None:
+        """Of a node that is independent of all others, and so are its elements."""
+        node = self.model[name]
+        if name in self._kept:
+            own = self.marginal(name)
+            assert own is not None
+            mean, var = np.asarray(own.mean), np.asarray(own.var)
+            found = np.diag(var.reshape(-1))
+            if node.event_shape:  # shares: m_i m_j / (a + 1) is what moves between them
+                n = node.event_shape[-1]
+                rows, shares = mean.reshape(-1, n), var.reshape(-1, n)
+                unit = (shares.sum(axis=-1) / (rows * (1.0 - rows)).sum(axis=-1))[:, None, None]
+                block = unit * (rows[:, :, None] * np.eye(n) - rows[:, :, None] * rows[:, None])
+                for k, one in enumerate(block):
+                    found[k * n : (k + 1) * n, k * n : (k + 1) * n] = one
+            return found
+        table = self.probabilities(name)
+        if table is None or node.domain is None:
+            return None
+        numbers = np.asarray(node.domain.numbers, dtype=float)
+        away = numbers - (table @ numbers)[..., None]
+        return np.diag((table * away**2).sum(axis=-1).reshape(-1))
 
     def _held(self, name: str) -> tuple[Conjugates, np.ndarray]:
         kept = self._kept[name]
