@@ -11,8 +11,8 @@ Who answers, and what each of them approximates:
   where it stands (``linearize=True``), and merges; its smoother is Kim's;
 - ``ExpectationPropagation``, smoothed, passes messages between these Gaussians until they agree;
 - an extended Kalman filter takes the target to fly straight on, pushed about by more noise;
-- marginalised particles draw modes, and each has a Kalman filter. Its readings could be linearised by name, as
-  above; here those of a scan are converted to a position with the covariance that a reading there has (Lerro
+- marginalised particles draw modes, and each has a Kalman filter. Its readings could be linearised by name,
+  too; here those of a scan are converted to a position with the covariance that a reading there has (Lerro
   and Bar-Shalom), which is the approximation; Doppler is left out;
 - particles that draw everything approximate nothing but by chance.
 

@@ -154,6 +154,8 @@ def read_series(
     if ahead:
         check_steps("forecast", ahead)
     count = count_of(timed, _input_rows(template, inputs), steps, ahead)
+    if count == ahead:  # series without rows say nothing
+        timed = {}
     sizes = sizes_of(template, {**timed, **(inputs or {})}, plates)
     rows = read_input_rows(template, sizes, inputs, count)
     two = {n: v[min(1, count - 1)] for n, v in rows.items()}

@@ -722,3 +722,22 @@ def test_they_say_who_they_are_and_that_answers_are_approximate(family: Any) -> 
         assert "approximate" in str(bmc.explain(dbn, rows, engine=engine, question=question))
     with pytest.raises(ValueError, match="positive number of bytes"):
         family(max_bytes=True)
+
+
+def test_what_the_frontier_refuses_is_refused_row_by_row() -> None:
+    """A reading of b tells a of the same slice, which the frontier would not hear."""
+    dbn = bmc.DynamicBayesNet("irregular")
+    dbn.table("a", ["a_prev"], [[0.9, 0.1], [0.1, 0.9]], initial=[0.5, 0.5])
+    wear = [[[0.95, 0.05], [0.1, 0.9]], [[0.9, 0.1], [0.05, 0.95]]]
+    dbn.table("b", ["b_prev", "a"], wear, initial=[0.5, 0.5])
+    dbn.table("y", ["b"], [[0.95, 0.05], [0.05, 0.95]])
+    engine = bmc.FactoredFrontier()
+    belief = engine.start(dbn)
+    for ask in (
+        lambda: engine.step(belief, {"y": 1}),
+        lambda: bmc.filter(dbn, {"y": [1, 1]}, engine=engine),
+    ):
+        with pytest.raises(
+            UnsupportedError, match="'b' would not reach its parent 'a'.*BoyenKoller"
+        ):
+            ask()

@@ -577,3 +577,14 @@ def test_online_memory_is_flat() -> None:
     grown = tracemalloc.get_traced_memory()[0] - before
     tracemalloc.stop()
     assert grown < 50_000  # a hundred bytes a step, when one belief holds ten thousand
+
+
+@pytest.mark.parametrize("engine", [None, KalmanFilter(), bmc.GridFilter(), bmc.ParticleFilter(50)])
+def test_forecasts_from_no_rows_are_those_without_data(engine: Any) -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(2.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    empty, nothing = (
+        bmc.forecast(dbn, rows, steps=2, engine=engine, rng=0) for rows in ({"y": []}, {})
+    )
+    np.testing.assert_array_equal(empty.mean("y"), nothing.mean("y"))

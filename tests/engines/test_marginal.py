@@ -121,7 +121,7 @@ def test_marginals_are_exact_ones_under_holm(proposal: str | None) -> None:
     """Filtered figures of the last slice times estimated over exact evidence, which have no bias."""
     engine = bmc.ParticleFilter(200, marginalize="auto", proposal=proposal)
     asked = 0
-    for seed in range(30, 30 + session.scaled(3, 8)):
+    for seed in range(30, 30 + session.scaled(2, 12)):
         case = random_switching_dbn(seed)
         try:
             right = exact(case.dbn, case.observations, case.inputs or None)

@@ -765,7 +765,10 @@ def test_ancestors_of_elements_of_a_plate_end_each_for_itself() -> None:
     x, (a, b) = clouds[0].values["x"], (c.ancestors for c in clouds[1:])
     expected = [x[a[b[:, 0], 0], 0], x[a[:, 1], 1], x[:, 2]]
     assert np.array_equal(found.values["x"], np.stack(expected, axis=1))
+    came_from = a[b[:, 0], 0], a[:, 1], np.arange(40)
     for k, speaks in enumerate((2, 1, 0)):
-        for what in ("weights", "log_weights", "total", "log_total", "ess"):
+        for what in ("weights", "log_weights", "total", "log_total"):
             given, wanted = (np.asarray(getattr(c, what)) for c in (found, clouds[speaks]))
             assert np.array_equal(given[..., k], wanted[..., k]), what
+        shares = np.bincount(came_from[k], clouds[speaks].weights[:, k])  # of each ancestor
+        assert found.ess[k] == pytest.approx(shares.sum() ** 2 / (shares**2).sum())

@@ -255,3 +255,15 @@ def test_published_models(name: str, reference_data: Path) -> None:
         error = figures.mcse if np.isfinite(figures.mcse) else 0.03 * figures.sd
         error = np.hypot(check.posterior.mcse(node)[index], error)
         assert abs(check.posterior.mean(node)[index] - figures.mean) < 4.5 * error, reference
+
+
+def test_answers_that_move_are_not_called_near_whatever_k_is() -> None:
+    """A loop of certain tables: few states, so that the largest weights are equal."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.3))
+    net.add("b", lambda a: bmc.Bernoulli(1.0 * a))
+    net.add("c", lambda a, b: bmc.Bernoulli(1.0 * ((a == 1) | (b == 1))))
+    check = bmc.infer(net, {"c": 1}, engine=bmc.ExpectationPropagation()).check(rng=0)
+    assert check.k < 0.5 and check.moved > 0.3
+    assert "plain answers are off by what is printed" in str(check)
+    assert check.posterior.mean("a") == pytest.approx(1.0)

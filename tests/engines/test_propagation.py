@@ -59,7 +59,7 @@ def test_exact_where_modes_make_no_difference_and_with_two_slices(difference: fl
 def test_random_templates_are_nearer_than_with_kims_smoother() -> None:
     """Bounds are some four times what 24 templates gave: 5e-5 and 1.6e-5 on average; GPB2: .0018, .011."""
     logs, modes, kim, numbers = [], [], [], []
-    for seed in range(session.scaled(16, 5)):
+    for seed in range(session.scaled(8, 10)):
         case, right = answered(seed, 1.0)
         if right is None:
             continue

@@ -73,6 +73,7 @@ WANTED = {
     "lost": ("x", "z"),
     "regression": ("x", "y", "z"),
     "vague": ("x",),
+    "begun": ("x", "l"),
 }
 
 

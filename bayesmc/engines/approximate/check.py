@@ -37,6 +37,8 @@ from bayesmc.structure.target import target_of
 _FEWEST = 25
 #: differences of log weights that are rounding
 _EQUAL = 1e-7
+#: share of a standard deviation up to which answers are near
+_NEAR = 0.15
 #: rows of the summary
 _ROWS = 12
 
@@ -60,12 +62,14 @@ class Check:
     ----------
     k : float
         Shape of the tail of the weights p/q, or of those of draws with heavier tails (whichever is larger):
-        below 0.5 good, above ``bound`` not to be trusted. Minus infinity where all weights are equal: the
-        approximation is exact.
+        below 0.5 the weights carry corrected answers well, above ``bound`` not. Minus infinity where the
+        largest weights are equal, as where the approximation is exact, or states are few.
     bound : float
         The largest k at which as many draws can be trusted, 0.7 of some 2,200 draws or more.
     ok : bool
-        Whether ``k`` is below it.
+        Whether ``k`` is below it, and the engine settled.
+    moved : float
+        How far the mean that is farthest off moved when it was corrected, in standard deviations.
     posterior : Posterior
         Corrected answers: the draws with smoothed weights, and Monte Carlo errors that count these.
     log_marginal_likelihood, log_marginal_likelihood_mcse : float
@@ -84,7 +88,13 @@ class Check:
 
     @property
     def ok(self) -> bool:
-        return bool(self.k < self.bound)
+        return bool(self.k < self.bound) and self._is_settled
+
+    @property
+    def moved(self) -> float:
+        return max(
+            (abs(row[-1]) if np.isfinite(row[-1]) else np.inf for row in self._rows), default=0.0
+        )
 
     @property
     def log_marginal_likelihood(self) -> float:
@@ -98,18 +108,15 @@ class Check:
 
     def __str__(self) -> str:
         own, ess = self.posterior.k, self.posterior.weight_ess
-        plain_words = (
-            "near" if self.k < min(0.5, self.bound) else "off" if self.ok else "not to be trusted"
-        )
         words = "right within their errors"
         if not own < self.bound:
             words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
-        elif not self.ok:
+        elif not self.k < self.bound:
             words += ", if nothing lies where no draw went"
         lines = [
             f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
             f"own coordinates (made in {self.approximation.coordinates})",
-            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {plain_words}",
+            f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {self._plain_words()}",
             f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
         ]
         plain = self.approximate.log_marginal_likelihood
@@ -127,9 +134,21 @@ class Check:
             own._live("check"), own.engine, own._stored, own._shape, independent=True
         )
 
-    def _moved(self) -> list[str]:
-        """The scalars whose means moved most, in standard deviations."""
-        rows = []
+    @property
+    def _is_settled(self) -> bool:
+        return bool(getattr(self.approximate, "converged", True))
+
+    def _plain_words(self) -> str:
+        if not self.ok:
+            return "not to be trusted" if self._is_settled else "of a run that did not settle"
+        spreads = (abs(row[5] / row[4] - 1.0) for row in self._rows if row[4] > 0)
+        off = max(self.moved, max(spreads, default=0.0))
+        return "near" if self.k < 0.5 and off < _NEAR else "off by what is printed"
+
+    @cached_property
+    def _rows(self) -> list[Any]:
+        """Scalars by how far their means moved: name, means, error, deviations, the move in these."""
+        rows: list[Any] = []
         for name in self.posterior.names:
             node = self.posterior.model[name]
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
@@ -141,10 +160,16 @@ class Check:
             before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
             error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
             with np.errstate(all="ignore"):
-                moved = np.where(after > 0, (found - plain) / after, 0.0)
+                certain = np.where(np.abs(found - plain) > _EQUAL, np.inf, 0.0)
+                moved = np.where(after > _EQUAL * before, (found - plain) / after, certain)
             labels = self.posterior._row_names(node)
             rows += list(zip(labels, plain, found, error, before, after, moved, strict=True))
         rows.sort(key=lambda row: -abs(row[-1]) if np.isfinite(row[-1]) else -np.inf)
+        return rows
+
+    def _moved(self) -> list[str]:
+        """The scalars whose means moved most, in standard deviations."""
+        rows = self._rows
         if not rows:
             return []
         width = max(len(row[0]) for row in rows[:_ROWS])
@@ -177,7 +202,7 @@ def checked(
         own.k, found.k
     )  # mass that the approximation's own draws never meet shows in wider ones
     result = Check(k, _bound(int(draws)), found, posterior, approximation, int(draws))
-    if not result.ok:
+    if not k < result.bound:
         warnings.warn(_doubt(result), LowEssWarning, stacklevel=3)
     return result
 

@@ -13,9 +13,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import Series, SeriesProblem, Slices, read_static
+from bayesmc.dbn import Row, Series, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.finite import FiniteFilter
-from bayesmc.engines.discrete.posterior import FiniteBelief
+from bayesmc.engines.discrete.posterior import FiniteBelief, window
 from bayesmc.engines.discrete.rows import Variable
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
@@ -25,7 +25,7 @@ from bayesmc.engines.factored.frontier import FrontierRun
 from bayesmc.engines.factored.run import FactoredRun
 from bayesmc.engines.factored.slices import FactoredSlices
 from bayesmc.engines.slice_steps import plates_apart
-from bayesmc.errors import BudgetError
+from bayesmc.errors import BudgetError, UnsupportedError
 
 
 class FactoredBelief(FiniteBelief):
@@ -253,6 +253,20 @@ class FactoredFrontier(FactoredFilter):
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         return super().refusal(problem) or _why_irregular(self._plan(problem))
+
+    def _absorbed(self, belief: FiniteBelief, slices: Slices, row: Row) -> FiniteBelief:
+        seen = frozenset(n for n, o in row.seen.items() if o.mask is None)
+        absent = frozenset(n for n in slices.dynamic if n not in row.seen)
+        kept = slices.later.cache.setdefault("irregular rows", {})
+        if (seen, absent) not in kept:
+            series = window(slices, None if belief.state is None else belief.state.series, row)
+            static = read_static(slices, belief.static)
+            plan = self._planned(slices, static, series, seen, True, absent)
+            kept[seen, absent] = _why_irregular(plan)
+        reason = kept[seen, absent]
+        if reason is not None:
+            raise UnsupportedError(reason)
+        return super()._absorbed(belief, slices, row)
 
     def effort(self, problem: SeriesProblem) -> str:
         return (
