@@ -432,6 +432,15 @@ def test_refusals() -> None:
         bmc.infer(impossible, {"b": 1, "c": 0}, engine=bmc.MeanField())
 
 
+def test_vectors_seen_in_part_are_refused() -> None:
+    """Of one that nothing hides the part seen would be left out, and the prior answer."""
+    net = bmc.BayesNet()
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda m: bmc.MvNormal(bmc.stack([m, m]), np.array([[1.0, 0.9], [0.9, 1.0]])))
+    with pytest.raises(UnsupportedError, match="of 'y' some components are missing"):
+        bmc.infer(net, {"y": [3.0, np.nan]}, engine=bmc.MeanField(), rng=0)
+
+
 def test_a_bound_that_falls_is_a_fault() -> None:
     with pytest.raises(BoundError, match="fell"):
         check_bound(-10.0, -10.1)

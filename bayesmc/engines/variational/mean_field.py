@@ -27,7 +27,7 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import Posterior
@@ -235,6 +235,9 @@ class MeanField(Engine):
             )
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, type(self).__name__)
+        if parts is not None:
+            return parts
         try:
             plan = self._plan(problem)
         except UnsupportedError as error:
