@@ -441,6 +441,23 @@ def test_vectors_seen_in_part_are_refused() -> None:
         bmc.infer(net, {"y": [3.0, np.nan]}, engine=bmc.MeanField(), rng=0)
 
 
+@pytest.mark.parametrize(("sigmoid", "scale"), [(special.ndtr, 5.0), (special.expit, 20.0)])
+@pytest.mark.parametrize("mixed", [False, True])
+def test_no_and_yes_are_mirror_images_far_out(sigmoid: Any, scale: float, mixed: bool) -> None:
+    """Where ``log(1 - p)`` is zero to the last digit, too: steps, tables and the bound see one function."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, scale))
+    net.add("k", bmc.Bernoulli(0.5))
+    shift = 2.0 if mixed else 0.0
+    net.add("y", lambda x, k: bmc.Bernoulli(sigmoid(x + shift * (k - 0.5))))
+    yes, no = (bmc.infer(net, {"y": y}, engine=bmc.MeanField(restarts=1), rng=0) for y in (1, 0))
+    np.testing.assert_allclose(yes.mean("x"), -no.mean("x"), rtol=1e-5)
+    np.testing.assert_allclose(yes.std("x"), no.std("x"), rtol=1e-5)
+    np.testing.assert_allclose(yes.elbo, no.elbo, rtol=1e-6)
+    np.testing.assert_allclose(yes.probabilities("k"), no.probabilities("k")[::-1], rtol=1e-5)
+    assert yes.elbo < math.log(0.5)  # of the evidence
+
+
 def test_a_bound_that_falls_is_a_fault() -> None:
     with pytest.raises(BoundError, match="fell"):
         check_bound(-10.0, -10.1)

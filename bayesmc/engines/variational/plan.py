@@ -295,7 +295,7 @@ def hold_at_points(plan: Plan) -> None:
                 state[FREE] = np.broadcast_to(
                     plan.free.mean, (len(plan.free.weights), plan.free.size)
                 )
-            found = plan.energy(state)
+            found = plan.energy_as_written(state)
         if not np.isfinite(want):
             continue
         if not abs(found - want) <= _ROUNDING * (1.0 + abs(want)) * 10:
