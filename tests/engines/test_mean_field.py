@@ -441,6 +441,31 @@ def test_vectors_seen_in_part_are_refused() -> None:
         bmc.infer(net, {"y": [3.0, np.nan]}, engine=bmc.MeanField(), rng=0)
 
 
+@pytest.mark.parametrize(
+    ("mean", "jumps"),
+    [
+        (lambda x: np.where(x > 0, 0.9, 0.2), True),
+        (lambda x: np.sign(x - 40.0), True),
+        (lambda x: np.floor(x / 7.0), True),
+        (lambda x: 1.0 * (x > 41.0), True),
+        (lambda x: x % 1, True),
+        (lambda x: np.where(x > 40.0, x, 40.0), False),
+        (lambda x: np.abs(x - 40.0), False),
+        (lambda x: np.where(x > 1e6, 1.0, np.tanh(x)), False),  # out of reach
+    ],
+)
+def test_jumps_are_refused_and_bends_are_not(mean: Any, jumps: bool) -> None:
+    """Points cross a jump without a gradient telling: the factor would be that of another density."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(40.0 if not jumps else 39.0, 45.0))
+    net.add("y", lambda x: bmc.Normal(mean(x), 1.0))
+    if jumps:
+        with pytest.raises(UnsupportedError, match="jumps at some values of node 'x'"):
+            bmc.infer(net, {"y": 0.7}, engine=bmc.MeanField(restarts=1), rng=0)
+    else:
+        bmc.infer(net, {"y": 0.7}, engine=bmc.MeanField(restarts=1), rng=0)
+
+
 @pytest.mark.parametrize(("sigmoid", "scale"), [(special.ndtr, 5.0), (special.expit, 20.0)])
 @pytest.mark.parametrize("mixed", [False, True])
 def test_no_and_yes_are_mirror_images_far_out(sigmoid: Any, scale: float, mixed: bool) -> None:

@@ -72,7 +72,8 @@ class Step:
             used = [s for s in used if s.by_label is None]
             self.by_label = ByLabel(terms, free) if terms else None
         if used:
-            slopes = gradient(*_climbed([total_of(s.total for s in used)], free), factor.moments)
+            (total,) = _climbed([total_of(s.total for s in used)], free)
+            slopes = gradient(total, factor.moments)
             self._names = tuple(slopes)
             roots = _climbed([slopes[n] for n in self._names], free)
             self._program = Program(for_arrays(roots))
