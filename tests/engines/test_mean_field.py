@@ -22,6 +22,7 @@ from bayesmc.engines.approximate.stored import completed
 from bayesmc.engines.variational.ascent import BoundError, check_bound
 from bayesmc.errors import (
     ConvergenceWarning,
+    EngineWarning,
     LowEssWarning,
     ReducibleWarning,
     UnsupportedError,
@@ -211,6 +212,7 @@ def finite_net(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any], 
     return net, seen, ["v0", "v1", "v3"]
 
 
+@pytest.mark.filterwarnings("ignore:MeanField. starts settled")
 @pytest.mark.parametrize("seed", range(session.scaled(6, 30)))
 def test_tables_are_a_fixed_point(seed: int) -> None:
     """Every factor is what the others make the best one, and the bound is what it says, by all states."""
@@ -483,6 +485,29 @@ def test_no_and_yes_are_mirror_images_far_out(sigmoid: Any, scale: float, mixed:
     assert yes.elbo < math.log(0.5)  # of the evidence
 
 
+def test_places_that_differ_are_told_and_orders_of_components_are_not() -> None:
+    """Two dice that add up to two (from 0): one of three ways answers, with bounds that are all the same."""
+    net = bmc.BayesNet()
+    net.table("a", [], np.full(6, 1 / 6))
+    net.table("b", [], np.full(6, 1 / 6))
+    net.add("sum", lambda a, b: bmc.Normal(1.0 * a + b, 0.01))
+    with pytest.warns(
+        EngineWarning, match=r"starts settled in . places .*bounds 0.102713, 0.102713"
+    ):
+        bmc.infer(net, {"sum": 2.0}, engine=bmc.MeanField(), rng=0)
+    rng = np.random.default_rng(0)
+    mix = bmc.BayesNet(plates={"kind": 2, "i": 30})
+    mix.add("weights", bmc.Dirichlet(np.ones(2)))
+    mix.add("mean", bmc.Normal(0.0, 10.0), plates="kind")
+    mix.add("label", lambda weights: bmc.Categorical(weights), plates="i")
+    mix.add("x", lambda label, mean: bmc.Normal(mean[label], 1.0), plates="i")
+    x = rng.normal(size=30) + np.where(np.arange(30) < 10, -4.0, 4.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        posterior = bmc.infer(mix, {"x": x}, engine=bmc.MeanField(), rng=0)
+    assert np.ptp(posterior.bounds[:3]) < 1e-3
+
+
 def test_a_bound_that_falls_is_a_fault() -> None:
     with pytest.raises(BoundError, match="fell"):
         check_bound(-10.0, -10.1)
@@ -622,6 +647,7 @@ def matrices(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
     return net, {"x": rng.normal(size=(20, 2))}
 
 
+@pytest.mark.filterwarnings("ignore:MeanField. starts settled")
 @pytest.mark.parametrize(
     ("make", "blocks"),
     [
