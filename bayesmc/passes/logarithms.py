@@ -76,6 +76,8 @@ def log_of(node: Expression) -> Expression | None:
 
 #: operands of a pick that are looked at
 _FEW = 16
+#: functions whose value at ``-x`` is one less that at ``x``, and their logarithms
+_SIGMOIDS: Mapping[Any, Any] = {special.expit: special.log_expit, special.ndtr: special.log_ndtr}
 
 
 def _is_positive(node: Expression) -> bool:
@@ -133,8 +135,9 @@ def _log1p(x: Expression) -> Expression | None:
     if _is(x, np.exp):
         return _softplus(x.operands[0])
     inner = _negated(x)
-    if inner is not None and _is(inner, special.expit):
-        return elementwise(special.log_expit, _negative(inner.operands[0]))
+    for sigmoid, log in _SIGMOIDS.items():
+        if inner is not None and _is(inner, sigmoid):
+            return elementwise(log, _negative(inner.operands[0]))
     return None
 
 
@@ -154,8 +157,9 @@ def _xlog1py(a: Expression, y: Expression) -> Expression | None:
 
 
 def _subtract(a: Expression, b: Expression) -> Expression | None:
-    if is_all(a, 1.0) and _is(b, special.expit):
-        return elementwise(special.expit, _negative(b.operands[0]))
+    for sigmoid in _SIGMOIDS:
+        if is_all(a, 1.0) and _is(b, sigmoid):
+            return elementwise(sigmoid, _negative(b.operands[0]))
     return None
 
 
@@ -176,8 +180,9 @@ def _power(a: Expression, b: Expression) -> Expression | None:
 
 
 def _exp(x: Expression) -> Expression | None:
-    if _is(x, special.log_expit):
-        return elementwise(special.expit, x.operands[0])
+    for sigmoid, log in _SIGMOIDS.items():
+        if _is(x, log):
+            return elementwise(sigmoid, x.operands[0])
     return None
 
 
@@ -222,6 +227,7 @@ def _log_of_sum(a: Expression, b: Expression) -> Expression | None:
 _LOGS: Mapping[Any, Callable[..., Expression | None]] = {
     np.exp: lambda x: x,
     special.expit: lambda x: elementwise(special.log_expit, x),
+    special.ndtr: lambda x: elementwise(special.log_ndtr, x),
     np.multiply: _both(add),
     np.divide: _both(subtract),
     np.sqrt: _scaled(0.5),

@@ -8,13 +8,15 @@ the density is looked at on both sides.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import Elementwise, Expression, Program, elementwise, ordered
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
+from bayesmc.structure.target import Values
 from bayesmc.structure.unconstrained_check import other_values
 
 #: what is another from one number to the next, besides comparisons and whole numbers
@@ -23,6 +25,8 @@ _STEPS = (np.floor, np.ceil, np.trunc, np.rint, np.sign, np.floor_divide, np.rem
 _WAYS, _SPREAD, _HALVES = 8, 2.0, 48
 #: difference of the log density that is left at a jump, and numbers that are looked at, at most
 _JUMP, _NUMBERS = 1e-3, 4_000_000
+#: the size of a log density from which on it stands for one of what is impossible
+_NEVER = 1e250
 
 #: the log density of every row of free numbers, and all that may turn there
 Looked = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -55,45 +59,102 @@ def jumps(density: UnconstrainedDensity) -> frozenset[str]:
     >>> sorted(jumps(unconstrained_density(target_of(pose(net, {"y": [0.0, 0.0, 2.0]})))))
     ['change']
     """
-    steps = [_whole(node) for node in ordered(density.root) if _is_step(node)]
-    if not steps:
-        return frozenset()
-    program = Program([density.root, *steps])
+    steps = _steps(density.root, FREE)
     count = len(density.nodes) * _WAYS
-    if count * sum(max(int(np.prod(s.shape)), 1) for s in steps) > _NUMBERS:
+    if not steps or count * _size(steps) > _NUMBERS:
         return frozenset()
     try:
         values = other_values(density, 0)
     except UnsupportedError:
         return frozenset()
-
-    def looked(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        with np.errstate(all="ignore"):
-            root, *found = program({**values, FREE: u})
-        sides = [np.broadcast_to(f, (count, *s.shape)) for f, s in zip(found, steps, strict=True)]
-        flat = [np.asarray(side, float).reshape(count, -1) for side in sides]
-        return np.broadcast_to(root, (count,)), np.concatenate(flat, axis=1)
-
     rng = np.random.default_rng(density.size)
     low = _SPREAD * rng.normal(size=(count, density.size))
     high = low.copy()
     for k, node in enumerate(density.nodes):
         rows, numbers = slice(k * _WAYS, (k + 1) * _WAYS), slice(node.start, node.start + node.size)
         high[rows, numbers] = _SPREAD * rng.normal(size=(_WAYS, node.size))
-    low, high, turned = _bisected(low, high, looked, rng)
-    before, after = (looked(u)[0] for u in (low, high))
-    with np.errstate(invalid="ignore"):
-        differ = turned & np.isfinite(before) & np.isfinite(after)
-        differ &= np.abs(after - before) > _JUMP * (1.0 + 1e-9 * np.abs(before))
+    differ = _jumped(density.root, steps, FREE, values, low, high, rng)
     owners = np.repeat(np.arange(len(density.nodes)), _WAYS)
     return frozenset(density.nodes[k].name for k in np.unique(owners[differ]))
+
+
+def jumps_between(
+    root: Expression, name: str, values: Values, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Whether a log density of free numbers jumps on the ways between pairs of points, where tried.
+
+    Parameters
+    ----------
+    root : Expression
+    name : str
+        Its leaf of free numbers.
+    values : mapping
+        Its other leaves.
+    low, high : ndarray, shape (ways, size)
+
+    Returns
+    -------
+    ndarray of bool, shape (ways,)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import TracedArray, leaf, trace
+    >>> from bayesmc.structure.jumps import jumps_between
+    >>> root = trace(lambda u: np.where(u > 1.0, 0.3, 0.0).sum(), [TracedArray(leaf("u", (1,)))])
+    >>> low, high = np.array([[0.0], [0.0]]), np.array([[0.5], [2.0]])
+    >>> jumps_between(root, "u", {}, low, high)
+    array([False,  True])
+    """
+    steps, rng = _steps(root, name), np.random.default_rng(low.shape[1])
+    found = np.zeros(len(low), bool)
+    if steps:
+        some = max(1, _NUMBERS // _size(steps))
+        for start in range(0, len(low), some):
+            part = slice(start, start + some)
+            found[part] = _jumped(root, steps, name, values, low[part], high[part], rng)
+    return found
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _is_step(node: Expression) -> bool:
-    if FREE not in node.leaves:
+def _steps(root: Expression, name: str) -> list[Expression]:
+    return [_whole(node) for node in ordered(root) if _is_step(node, name)]
+
+
+def _size(steps: Sequence[Expression]) -> int:
+    return sum(max(math.prod(s.shape), 1) for s in steps)
+
+
+def _jumped(
+    root: Expression,
+    steps: Sequence[Expression],
+    name: str,
+    values: Values,
+    low: np.ndarray,
+    high: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Whether the density differs on both sides of a turn, for each way."""
+    program, count = Program([root, *steps]), len(low)
+
+    def looked(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        with np.errstate(all="ignore"):
+            log, *found = program({**values, name: u})
+        sides = [np.broadcast_to(f, (count, *s.shape)) for f, s in zip(found, steps, strict=True)]
+        flat = [np.asarray(side, float).reshape(count, -1) for side in sides]
+        return np.broadcast_to(log, (count,)), np.concatenate(flat, axis=1)
+
+    low, high, turned = _bisected(low, high, looked, rng)
+    before, after = (looked(u)[0] for u in (low, high))
+    with np.errstate(invalid="ignore"):
+        differ = turned & (np.abs(before) < _NEVER) & (np.abs(after) < _NEVER)
+        return differ & (np.abs(after - before) > _JUMP * (1.0 + 1e-9 * np.abs(before)))
+
+
+def _is_step(node: Expression, name: str) -> bool:
+    if name not in node.leaves:
         return False
     return node.dtype.kind in "biu" or (isinstance(node, Elementwise) and node.function in _STEPS)
 

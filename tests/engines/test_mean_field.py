@@ -22,6 +22,7 @@ from bayesmc.engines.approximate.stored import completed
 from bayesmc.engines.variational.ascent import BoundError, check_bound
 from bayesmc.errors import (
     ConvergenceWarning,
+    EngineWarning,
     LowEssWarning,
     ReducibleWarning,
     UnsupportedError,
@@ -211,6 +212,7 @@ def finite_net(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any], 
     return net, seen, ["v0", "v1", "v3"]
 
 
+@pytest.mark.filterwarnings("ignore:MeanField. starts settled")
 @pytest.mark.parametrize("seed", range(session.scaled(6, 30)))
 def test_tables_are_a_fixed_point(seed: int) -> None:
     """Every factor is what the others make the best one, and the bound is what it says, by all states."""
@@ -432,6 +434,80 @@ def test_refusals() -> None:
         bmc.infer(impossible, {"b": 1, "c": 0}, engine=bmc.MeanField())
 
 
+def test_vectors_seen_in_part_are_refused() -> None:
+    """Of one that nothing hides the part seen would be left out, and the prior answer."""
+    net = bmc.BayesNet()
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda m: bmc.MvNormal(bmc.stack([m, m]), np.array([[1.0, 0.9], [0.9, 1.0]])))
+    with pytest.raises(UnsupportedError, match="of 'y' some components are missing"):
+        bmc.infer(net, {"y": [3.0, np.nan]}, engine=bmc.MeanField(), rng=0)
+
+
+@pytest.mark.parametrize(
+    ("mean", "jumps"),
+    [
+        (lambda x: np.where(x > 0, 0.9, 0.2), True),
+        (lambda x: np.sign(x - 40.0), True),
+        (lambda x: np.floor(x / 7.0), True),
+        (lambda x: 1.0 * (x > 41.0), True),
+        (lambda x: x % 1, True),
+        (lambda x: np.where(x > 40.0, x, 40.0), False),
+        (lambda x: np.abs(x - 40.0), False),
+        (lambda x: np.where(x > 1e6, 1.0, np.tanh(x)), False),  # out of reach
+    ],
+)
+def test_jumps_are_refused_and_bends_are_not(mean: Any, jumps: bool) -> None:
+    """Points cross a jump without a gradient telling: the factor would be that of another density."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(40.0 if not jumps else 39.0, 45.0))
+    net.add("y", lambda x: bmc.Normal(mean(x), 1.0))
+    if jumps:
+        with pytest.raises(UnsupportedError, match="jumps at some values of node 'x'"):
+            bmc.infer(net, {"y": 0.7}, engine=bmc.MeanField(restarts=1), rng=0)
+    else:
+        bmc.infer(net, {"y": 0.7}, engine=bmc.MeanField(restarts=1), rng=0)
+
+
+@pytest.mark.parametrize(("sigmoid", "scale"), [(special.ndtr, 5.0), (special.expit, 20.0)])
+@pytest.mark.parametrize("mixed", [False, True])
+def test_no_and_yes_are_mirror_images_far_out(sigmoid: Any, scale: float, mixed: bool) -> None:
+    """Where ``log(1 - p)`` is zero to the last digit, too: steps, tables and the bound see one function."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, scale))
+    net.add("k", bmc.Bernoulli(0.5))
+    shift = 2.0 if mixed else 0.0
+    net.add("y", lambda x, k: bmc.Bernoulli(sigmoid(x + shift * (k - 0.5))))
+    yes, no = (bmc.infer(net, {"y": y}, engine=bmc.MeanField(restarts=1), rng=0) for y in (1, 0))
+    np.testing.assert_allclose(yes.mean("x"), -no.mean("x"), rtol=1e-5)
+    np.testing.assert_allclose(yes.std("x"), no.std("x"), rtol=1e-5)
+    np.testing.assert_allclose(yes.elbo, no.elbo, rtol=1e-6)
+    np.testing.assert_allclose(yes.probabilities("k"), no.probabilities("k")[::-1], rtol=1e-5)
+    assert yes.elbo < math.log(0.5)  # of the evidence
+
+
+def test_places_that_differ_are_told_and_orders_of_components_are_not() -> None:
+    """Two dice that add up to two (from 0): one of three ways answers, with bounds that are all the same."""
+    net = bmc.BayesNet()
+    net.table("a", [], np.full(6, 1 / 6))
+    net.table("b", [], np.full(6, 1 / 6))
+    net.add("sum", lambda a, b: bmc.Normal(1.0 * a + b, 0.01))
+    with pytest.warns(
+        EngineWarning, match=r"starts settled in . places .*bounds 0.102713, 0.102713"
+    ):
+        bmc.infer(net, {"sum": 2.0}, engine=bmc.MeanField(), rng=0)
+    rng = np.random.default_rng(0)
+    mix = bmc.BayesNet(plates={"kind": 2, "i": 30})
+    mix.add("weights", bmc.Dirichlet(np.ones(2)))
+    mix.add("mean", bmc.Normal(0.0, 10.0), plates="kind")
+    mix.add("label", lambda weights: bmc.Categorical(weights), plates="i")
+    mix.add("x", lambda label, mean: bmc.Normal(mean[label], 1.0), plates="i")
+    x = rng.normal(size=30) + np.where(np.arange(30) < 10, -4.0, 4.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        posterior = bmc.infer(mix, {"x": x}, engine=bmc.MeanField(), rng=0)
+    assert np.ptp(posterior.bounds[:3]) < 1e-3
+
+
 def test_a_bound_that_falls_is_a_fault() -> None:
     with pytest.raises(BoundError, match="fell"):
         check_bound(-10.0, -10.1)
@@ -571,6 +647,7 @@ def matrices(rng: np.random.Generator) -> tuple[bmc.BayesNet, dict[str, Any]]:
     return net, {"x": rng.normal(size=(20, 2))}
 
 
+@pytest.mark.filterwarnings("ignore:MeanField. starts settled")
 @pytest.mark.parametrize(
     ("make", "blocks"),
     [

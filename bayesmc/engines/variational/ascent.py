@@ -129,17 +129,17 @@ def best_of(
     found = []
     for ascent in ascents(plan, restarts, rng):
         ascent.climb(min(_FIRST, sweeps), tolerance, _NEAR)
-        found.append(_stored(plan, ascent))
+        found.append(stored(plan, ascent))
         told(1)
     found.sort(key=lambda a: -a.bounds[-1])
     best, rest = found[:_KEPT], found[_KEPT:]
     for ascent in best:
-        _restored(plan, ascent)
+        restored(plan, ascent)
         if not ascent.converged:
             ascent.climb(sweeps - len(ascent.bounds), tolerance)
-        _stored(plan, ascent)
+        stored(plan, ascent)
     best.sort(key=lambda a: -a.bounds[-1])
-    _restored(plan, best[0])
+    restored(plan, best[0])
     return best + rest
 
 
@@ -163,6 +163,18 @@ def started(plan: Plan, values: Values, k: int, rng: np.random.Generator) -> Asc
             state[factor.table] = _seeded(factor, state[factor.table], k, rng)
             step.tell(state)
     return Ascent(plan, state, [])
+
+
+def stored(plan: Plan, ascent: Ascent) -> Ascent:
+    """What the factors know besides moments is kept with the start."""
+    ascent.memory = [dict(f.__dict__) for f in plan.factors]
+    return ascent
+
+
+def restored(plan: Plan, ascent: Ascent) -> None:
+    """Make the factors know what they did at the end of a start."""
+    for factor, known in zip(plan.factors, ascent.memory, strict=True):
+        factor.__dict__.update(known)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -201,14 +213,3 @@ def _ahead(last: float, moved: float) -> float:
         return np.inf
     rate = moved / last if last > 0 else 1.0
     return moved * rate / (1.0 - rate) if rate < 1.0 else np.inf
-
-
-def _stored(plan: Plan, ascent: Ascent) -> Ascent:
-    """What the factors know besides moments is kept with the start."""
-    ascent.memory = [dict(f.__dict__) for f in plan.factors]
-    return ascent
-
-
-def _restored(plan: Plan, ascent: Ascent) -> None:
-    for factor, known in zip(plan.factors, ascent.memory, strict=True):
-        factor.__dict__.update(known)

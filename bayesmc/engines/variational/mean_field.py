@@ -16,18 +16,21 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
 from bayesmc.engines.variational.excluded import left_out
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
+from bayesmc.engines.variational.jumping import refuse_jumps
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
+from bayesmc.engines.variational.places import other_places, told
 from bayesmc.engines.variational.plan import plan_for
 from bayesmc.engines.variational.steps import Plan
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import (
     ConvergenceWarning,
+    EngineWarning,
     ReducibleWarning,
     UnsupportedError,
     ZeroProbabilityError,
 )
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import Posterior
@@ -182,6 +185,9 @@ class MeanField(Engine):
     -----
     ConvergenceWarning
         The best start had not settled after all sweeps.
+    EngineWarning
+        Starts settled in places that differ, by more than the order of a plate's elements, with bounds no
+        farther from the best than the logarithm of a hundredth.
     ReducibleWarning
         Zero probabilities tie finite nodes, and states were left out that may be probable.
 
@@ -235,6 +241,9 @@ class MeanField(Engine):
             )
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, type(self).__name__)
+        if parts is not None:
+            return parts
         try:
             plan = self._plan(problem)
         except UnsupportedError as error:
@@ -284,6 +293,7 @@ class MeanField(Engine):
         plan, rng = self._plan(problem), stream(seed, Purpose.INFER, 1)
         with Progress(int(self.restarts), self.label, progress) as bar:
             found = best_of(plan, self.restarts, self.sweeps, self.tolerance, rng, bar.advance)
+            places = other_places(plan, found, self.sweeps, self.tolerance)
         best, constant = found[0], known_factors(plan.target)
         if best.bounds[-1] < NEVER:
             raise UnsupportedError(
@@ -301,6 +311,7 @@ class MeanField(Engine):
         posterior.bounds = np.array([a.bounds[-1] for a in found]) + constant
         posterior.elbo, posterior.elbo_mcse = float(posterior.elbos[-1]), 0.0
         if plan.free is not None:
+            refuse_jumps(plan, best.state)
             posterior.elbo, posterior.elbo_mcse = measured(plan, best, rng, constant)
         posterior.log_marginal_likelihood = posterior.elbo
         posterior.sweeps, posterior.converged = len(best.bounds), best.converged
@@ -313,6 +324,8 @@ class MeanField(Engine):
                 ReducibleWarning,
                 stacklevel=3,
             )
+        elif len(places) > 1:
+            warnings.warn(told(places, constant), EngineWarning, stacklevel=3)
         if not best.converged:
             gain = best.bounds[-1] - best.bounds[-2] if len(best.bounds) > 1 else np.inf
             warnings.warn(

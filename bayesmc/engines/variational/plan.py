@@ -17,6 +17,7 @@ from bayesmc.engines.variational.factors import (
     TableFactor,
 )
 from bayesmc.engines.variational.free import FREE, FreeFactor
+from bayesmc.engines.variational.jumping import refuse_jumps
 from bayesmc.engines.variational.reading import TermReader, has_moments
 from bayesmc.engines.variational.steps import Plan
 from bayesmc.errors import TraceError, UnsupportedError
@@ -295,7 +296,8 @@ def hold_at_points(plan: Plan) -> None:
                 state[FREE] = np.broadcast_to(
                     plan.free.mean, (len(plan.free.weights), plan.free.size)
                 )
-            found = plan.energy(state)
+            found = plan.energy_as_written(state)
+            refuse_jumps(plan, state)
         if not np.isfinite(want):
             continue
         if not abs(found - want) <= _ROUNDING * (1.0 + abs(want)) * 10:

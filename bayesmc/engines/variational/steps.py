@@ -16,6 +16,7 @@ from bayesmc.expression import Expression, Program
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.derivatives import gradient
+from bayesmc.passes.logarithms import stable
 from bayesmc.structure.target import Target
 
 
@@ -26,7 +27,8 @@ class ByLabel:
         self.terms, self.free = terms, free
         self.statistics = np.concatenate([t.statistics for t in terms])
         self._turned = np.ascontiguousarray(self.statistics.T)
-        self._program = Program(for_arrays([t.coefficients for t in terms]))
+        coefficients = _climbed([t.coefficients for t in terms], free)
+        self._program = Program(for_arrays(coefficients))
         ends = np.cumsum([len(t.statistics) for t in terms])
         self._parts = [slice(e - len(t.statistics), e) for t, e in zip(terms, ends, strict=True)]
         self._logs = np.empty((terms[0].coefficients.shape[0], self.statistics.shape[1]))
@@ -70,9 +72,11 @@ class Step:
             used = [s for s in used if s.by_label is None]
             self.by_label = ByLabel(terms, free) if terms else None
         if used:
-            slopes = gradient(total_of(s.total for s in used), factor.moments)
+            (total,) = _climbed([total_of(s.total for s in used)], free)
+            slopes = gradient(total, factor.moments)
             self._names = tuple(slopes)
-            self._program = Program(for_arrays([slopes[n] for n in self._names]))
+            roots = _climbed([slopes[n] for n in self._names], free)
+            self._program = Program(for_arrays(roots))
 
     def update(self, state: State) -> None:
         """Make the factor the best given all others."""
@@ -160,9 +164,16 @@ class Plan:
         (found,) = self._energy(state)
         return np.asarray(found)
 
+    def energy_as_written(self, state: State) -> float:
+        """The same in the arithmetic of the model's own functions, to be held against these."""
+        if self.free is None:
+            return self.energy(state)
+        (found,) = Program(for_arrays([total_of(s.total for s in self.sums)]))(state)
+        return self.free.average(np.asarray(found))
+
     @cached_property
     def _energy(self) -> Program:
-        return Program(for_arrays([total_of(s.total for s in self.sums)]))
+        return Program(for_arrays(_climbed([total_of(s.total for s in self.sums)], self.free)))
 
 
 def averaged(value: np.ndarray, rank: int, free: FreeFactor | None) -> np.ndarray:
@@ -179,6 +190,11 @@ def total_of(parts: Iterable[Expression]) -> Expression:
     for part in parts:
         total = add(total, part)
     return total
+
+
+def _climbed(roots: Sequence[Expression], free: FreeFactor | None) -> list[Expression]:
+    """As the free factor climbs it: all steps are of one function far out, or the bound falls."""
+    return list(roots) if free is None else stable(roots)
 
 
 __all__ = ["FREE", "ByLabel", "Plan", "Step", "averaged", "total_of"]
