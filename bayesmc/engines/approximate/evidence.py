@@ -1,13 +1,15 @@
-"""What of the evidence no hidden node changes: factors that a target leaves out, since chains need none."""
+"""What of the evidence no hidden node changes, and what of it has no density that could be followed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import ZeroProbabilityError
+from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+from bayesmc.network import Problem
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.network.model import potential_shape
 from bayesmc.structure.target import Target, Term
 
@@ -44,6 +46,18 @@ def log_constants(target: Target) -> float:
             )
         total += float(log.sum())
     return total
+
+
+def why_not(problem: Problem, name: str, target: Callable[[], Target]) -> str | None:
+    """Why an engine of that name takes no such evidence: vectors seen in part, no noise, or no target."""
+    reason = refuse_parts(problem.observed, name)
+    if reason is not None:
+        return reason
+    try:
+        terms = [n for n in target().terms if n in problem.model.nodes]
+    except UnsupportedError as error:
+        return str(error)
+    return refuse_noiseless(problem.model, terms, name)
 
 
 # ---- private ------------------------------------------------------------------------------------

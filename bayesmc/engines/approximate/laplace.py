@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.distributions.transforms import Bounded, Identity, Wrapped
-from bayesmc.engines.approximate.evidence import log_constants
+from bayesmc.engines.approximate.evidence import log_constants, why_not
 from bayesmc.engines.approximate.free_gaussian import FreeGaussian
 from bayesmc.engines.approximate.modes import Mode, NoMode, modes_of
 from bayesmc.engines.approximate.posterior import DRAWS, ApproximatePosterior
@@ -19,7 +19,6 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import ConvergenceWarning, UnsupportedError
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.results import Posterior
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.free_nodes import FreeNode
@@ -113,15 +112,7 @@ class LaplaceApproximation(Engine):
         check_count(self, "draws", self.draws, "4000")
 
     def refusal(self, problem: Problem) -> str | None:
-        parts = refuse_parts(problem.observed, type(self).__name__)
-        if parts is not None:
-            return parts
-        try:
-            density = self._density(problem)
-        except UnsupportedError as error:
-            return str(error)
-        terms = [n for n in density.target.terms if n in problem.model.nodes]
-        return refuse_noiseless(problem.model, terms, type(self).__name__)
+        return why_not(problem, type(self).__name__, lambda: self._density(problem).target)
 
     def describe(self, problem: Problem) -> dict[str, str]:
         density = self._density(problem)

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.engines.approximate.approximation import Drawn, Marginal
-from bayesmc.engines.approximate.evidence import log_constants
+from bayesmc.engines.approximate.evidence import log_constants, why_not
 from bayesmc.engines.approximate.posterior import DRAWS, ApproximatePosterior
 from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
@@ -27,14 +27,12 @@ from bayesmc.errors import (
     EngineWarning,
     ReducibleWarning,
     UnsupportedError,
-    ZeroProbabilityError,
 )
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import Posterior
-from bayesmc.structure.target import Target, target_of
+from bayesmc.structure.target import target_of
 
 #: bounds below this are of what is impossible
 NEVER = -1e250
@@ -241,15 +239,7 @@ class MeanField(Engine):
             )
 
     def refusal(self, problem: Problem) -> str | None:
-        parts = refuse_parts(problem.observed, type(self).__name__)
-        if parts is not None:
-            return parts
-        try:
-            plan = self._plan(problem)
-        except UnsupportedError as error:
-            return str(error)
-        terms = [n for n in plan.target.terms if n in problem.model.nodes]
-        return refuse_noiseless(problem.model, terms, type(self).__name__)
+        return why_not(problem, type(self).__name__, lambda: self._plan(problem).target)
 
     def describe(self, problem: Problem) -> dict[str, str]:
         plan = self._plan(problem)
@@ -294,7 +284,7 @@ class MeanField(Engine):
         with Progress(int(self.restarts), self.label, progress) as bar:
             found = best_of(plan, self.restarts, self.sweeps, self.tolerance, rng, bar.advance)
             places = other_places(plan, found, self.sweeps, self.tolerance)
-        best, constant = found[0], known_factors(plan.target)
+        best, constant = found[0], log_constants(plan.target)
         if best.bounds[-1] < NEVER:
             raise UnsupportedError(
                 "MeanField: independent factors put mass where the joint density is zero, wherever they "
@@ -386,17 +376,3 @@ def measured(
         return found + entropy, abs(found - average(free.points, free.weights))
     each = [average(*fresh_points(free.size, rng)) for _ in range(_REPEATS)]
     return float(np.mean(each)) + entropy, float(np.std(each, ddof=1)) / np.sqrt(_REPEATS)
-
-
-def known_factors(target: Target) -> float:
-    """The log of all factors of what is known.
-
-    Raises
-    ------
-    ZeroProbabilityError
-        One of them is zero.
-    """
-    found = log_constants(target)
-    if found == -np.inf:
-        raise ZeroProbabilityError("MeanField: the evidence has probability zero")
-    return found
