@@ -76,7 +76,11 @@ def family_of(dist: d.Distribution) -> Family:
     if isinstance(dist, d.Categorical):
         return Family(d.Categorical, {"probs": as_expression(dist.probs), "logits": None})
     if isinstance(dist, (d.Affine, d.Truncated)):
-        names = [k for k in inspect.signature(type(dist)).parameters if k != "base"]
+        names = [
+            k
+            for k in inspect.signature(type(dist).__init__).parameters
+            if k not in ("self", "base")
+        ]
         kept = {k: _constant(getattr(dist, k)) for k in names}
         return Family(type(dist), {"base": family_of(dist.base), **kept})
     if isinstance(dist, d.Joint):
@@ -88,7 +92,8 @@ def family_of(dist: d.Distribution) -> Family:
         return Family(d.Mixture, {"weights": as_expression(dist.weights), "components": made})
     if isinstance(dist, d.KernelDensity):  # a normal about every point
         return _kernels(dist)
-    names = list(inspect.signature(type(dist)).parameters)
+    # of __init__: Python before 3.11.3 may take a class's signature from __new__
+    names = list(inspect.signature(type(dist).__init__).parameters)[1:]
     known = type(dist) in _FORMS or type(dist).log_density is not None
     if not known or not all(hasattr(dist, n) for n in names):
         raise TraceError(f"no closed log density of {type(dist).__name__} is known to derivatives")
