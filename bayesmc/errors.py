@@ -208,6 +208,24 @@ class FileFormatError(BayesmcError, ValueError):
         self.line = line
 
 
+class DamagedFileError(FileFormatError):
+    """A file of ours is cut off, or is not what was written.
+
+    Attributes
+    ----------
+    blocks : int
+        How many of its blocks are whole.
+    """
+
+    def __init__(self, message: str, blocks: int = 0) -> None:
+        super().__init__(message)
+        self.blocks = blocks
+
+
+class CheckpointError(BayesmcError, RuntimeError):
+    """A run cannot be saved, or its file belongs to another one."""
+
+
 class MissingExtraError(BayesmcError, ImportError):
     """An optional dependency is not installed; the message says which extra brings it."""
 
