@@ -8,7 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import Explanation, explain, filter, forecast, infer, most_likely, smooth
+from bayesmc.auto import Explanation, explain, filter, forecast, infer, load, most_likely, smooth
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
@@ -73,6 +73,7 @@ from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
+from bayesmc.storage import CheckpointFile
 from bayesmc.structure.log_density import log_density
 
 if TYPE_CHECKING:
@@ -90,6 +91,7 @@ __all__ = [
     "BoyenKoller",
     "Categorical",
     "Cauchy",
+    "CheckpointFile",
     "Density",
     "Dirichlet",
     "DiscreteFilter",
@@ -159,6 +161,7 @@ __all__ = [
     "forecast",
     "infer",
     "io",
+    "load",
     "log_density",
     "map",
     "markov",

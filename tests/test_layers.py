@@ -36,7 +36,7 @@ passes | lowering
 distributions
 expression
 linalg
-resampling | gaussian | diagnostics | markov | plates | states | randomness | progress
+resampling | gaussian | diagnostics | markov | plates | states | randomness | progress | storage
 categorical
 errors | shapes
 """
@@ -54,7 +54,7 @@ LONG_FUNCTIONS: set[str] = set()
 TYPE_CIRCLES: set[str] = set()
 
 HEAVY = ("scipy.stats", "networkx", "arviz_stats", "arviz_base", "matplotlib", "hypothesis",
-         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas")  # fmt: skip
+         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas", "h5py", "h5netcdf")  # fmt: skip
 
 
 def violations(sources: dict[str, str]) -> list[str]:

@@ -5,6 +5,7 @@ from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.running import Sums
+from bayesmc.results.saving import RunFile, save
 from bayesmc.results.series import SeriesPosterior
 from bayesmc.results.sums import RunningChains, SumsPosterior
 from bayesmc.results.table import Summary
@@ -16,9 +17,11 @@ __all__ = [
     "DrawsPosterior",
     "Marginal",
     "Posterior",
+    "RunFile",
     "RunningChains",
     "SeriesPosterior",
     "Summary",
     "Sums",
     "SumsPosterior",
+    "save",
 ]

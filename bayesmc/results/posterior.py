@@ -6,7 +6,9 @@ comes about (from draws, from sums, from exact tables) is each subclass's own af
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,10 @@ from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
+from bayesmc.network.fingerprint import fingerprint
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.query import Query
+from bayesmc.results.saving import save
 from bayesmc.results.table import Summary
 
 Plates = str | Sequence[str]
@@ -62,6 +66,8 @@ class Posterior:
 
     log_marginal_likelihood: float | None = None
     log_marginal_likelihood_mcse: float | None = None
+    #: inputs of the question, where the problem is lost
+    _known: Mapping[str, np.ndarray] = MappingProxyType({})
     #: importance weights normalised to sum to 1, shape (chain, draw); None where uniform or exact
     weights: np.ndarray | None = None
     log_weights: np.ndarray | None = None
@@ -337,7 +343,40 @@ class Posterior:
 
     def _reload(self) -> str:
         """How to have the functions again."""
-        return "declare the net and call infer again, or ask before pickling"
+        return "declare the net and call infer again, or ask before pickling (bmc.load takes net=)"
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file that ``bmc.load`` reads, and ArviZ and xarray, too.
+
+        It is NetCDF-4 (the extra ``netcdf``). Draws are under ``posterior``, weighted ones under
+        ``weighted_posterior``; of answers without draws, means, variances and probabilities under ``answers``.
+        The file takes the place of another one at once or not at all. Functions stay out.
+
+        Parameters
+        ----------
+        path : path
+
+        Raises
+        ------
+        MissingExtraError
+        CheckpointError
+            The disk is full, or may not be written.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet()
+        >>> net.add("die", bmc.DiscreteUniform(1, 6))
+        >>> bmc.infer(net).save("die.nc")  # doctest: +SKIP
+        >>> bmc.load("die.nc").mean("die")  # doctest: +SKIP
+        3.5
+        """
+        problem = self.problem
+        save(self, path, None if problem is None else {"fingerprint": fingerprint(problem.model)})
+
+    def bind(self, problem: Problem) -> None:
+        """Answer with the functions of a problem again, which a file or a pickle carries none of."""
+        self.problem, self.model = problem, problem.model
 
     def _cannot(self, what: str) -> UnsupportedError:
         return UnsupportedError(
@@ -349,7 +388,9 @@ class Posterior:
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
-        return {**self.__dict__, "problem": None, "model": self.model.without_functions()}
+        inputs = self.problem.inputs if self.problem is not None else self._known
+        bare = self.model.without_functions()
+        return {**self.__dict__, "problem": None, "model": bare, "_known": inputs}
 
     def __copy__(self) -> Posterior:
         """A posterior is never changed; copied like a pickle it would lose its functions."""

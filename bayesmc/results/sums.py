@@ -171,6 +171,10 @@ class SumsPosterior(Posterior):
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         return {}
 
+    def bind(self, problem: Problem) -> None:
+        super().bind(problem)
+        self._sums.model = problem.model
+
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
         sums = copy.copy(self._sums)
@@ -248,7 +252,16 @@ class RunningChains:
 
     def with_model(self, model: Model) -> RunningChains:
         """The same for another compilation of the same net, independent of this one."""
-        return copy.deepcopy(self, {id(self._sums.model): model})
+        found = copy.deepcopy(self, {id(self._sums.model): model})
+        found._sums.model = model  # where it was without one
+        return found
+
+    def without_model(self) -> RunningChains:
+        """What can be saved of it: the same arrays, and no net."""
+        found = copy.copy(self)
+        found._sums = copy.copy(self._sums)
+        found._sums.model = None  # type: ignore[assignment]
+        return found
 
     def _prepare(self, values: Mapping[str, np.ndarray]) -> None:
         """Decide from the first draw what is constant, and how many draws make a buffer."""

@@ -278,6 +278,12 @@ class ExactPosterior(Posterior):
             )
         return self.resample(resample, rng).to_datatree()
 
+    def bind(self, problem: Problem) -> None:
+        super().bind(problem)
+        self._tables.model = problem.model
+        if self._gaussian is not None:
+            self._gaussian.model = problem.model
+
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
         tables, gaussian = copy.copy(self._tables), copy.copy(self._gaussian)

@@ -14,13 +14,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.engines.base import Engine
+from bayesmc.engines.base import Engine, kept_names
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
 from bayesmc.engines.mcmc.given import frozen_start, read_start
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.saved import SavedChains
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
@@ -33,7 +34,7 @@ from bayesmc.errors import (
 from bayesmc.network import Problem
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunningChains
+from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunFile, RunningChains
 
 #: share of accepted proposals outside of which a random walk is ill adapted
 _BAND = (0.1, 0.9)
@@ -70,6 +71,7 @@ class ChainEngine(Engine):
     label: ClassVar[str]
     #: whether its kernels learn in few sweeps, so that a warmup may end as soon as starts are forgotten
     judges: ClassVar[bool] = False
+    saves: ClassVar[bool] = True
     #: whether each chain may be an array of members itself, so that more chains are not for free
     ensembles: ClassVar[bool] = False
 
@@ -123,10 +125,13 @@ class ChainEngine(Engine):
         if self.draws is not None:
             chains = LEAST if self.chains is None else self.chains
             return Lengths(chains, WARMUP if self.warmup is None else self.warmup, self.draws)
-        kept: Sequence[str] | None = keep
-        if isinstance(keep, str):
-            nodes = problem.model.nodes.items()
-            kept = [n for n, c in nodes if c.kind != "input"] if keep == "draws" else None
+        names, summed, spilled = kept_names(keep, problem)
+        if spilled:
+            raise UnsupportedError(
+                f"{type(self).__name__}: keep={keep!r} leaves draws in the file, and with draws=None their "
+                "number follows from them; give draws="
+            )
+        kept = None if summed else names
         return chosen(
             problem,
             self.warmup,
@@ -148,10 +153,9 @@ class ChainEngine(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        checkpoint: RunFile | None = None,
     ) -> Posterior:
-        listed, summed = not isinstance(keep, str), isinstance(keep, str) and keep == "summaries"
-        free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
-        names = tuple(keep) if listed else tuple(free)
+        names, summed, spilled = kept_names(keep, problem)
         asked = lengths = self.lengths(problem, keep)
         if resume is not None:
             lengths = self._refuse_another(resume, problem, names, summed, lengths)
@@ -173,10 +177,14 @@ class ChainEngine(Engine):
         tied = self.tied(problem)
         if tied:
             _warn_of_ties(type(self).__name__, tied)
+        saving = None
+        if checkpoint is not None:
+            saving = SavedChains(checkpoint, problem, names, spilled)
         try:
-            held = self._held(problem, sampler, names, summed, resume, lengths)
+            held = self._held(problem, sampler, names, summed, resume, lengths, saving)
             rng = stream(seed, Purpose.INFER)
             loop = Loop(sampler, rng, problem, lengths, self.thinning)
+            loop.saving = saving
             sweeps = lengths.draws * self.thinning + (lengths.warmup if resume is None else 0)
             with Progress(sweeps, self.label, progress) as bar, Patience() as stop:
                 state = loop.begun(bar, resume, stop)
@@ -190,11 +198,18 @@ class ChainEngine(Engine):
                 finished = self._drawn(loop, state, held, bar, stop, reached)
         except MemoryError as error:
             raise no_memory(self, lengths.draws * lengths.chains, names) from error
+        if spilled and isinstance(held, Kept) and saving is not None:
+            if not finished:  # draws are in the file, which is gone on with by the same call
+                raise KeyboardInterrupt
+            held.put(saving.stand_ins(lengths.chains, held.draws))
         posterior = self._posterior(problem, sampler, held, loop)
         diverged = loop.divergences(posterior._chains_and_draws[1])
         if diverged is not None:
             before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
             posterior.divergences = diverged if before is None else np.hstack([before, diverged])
+        if checkpoint is not None and saving is not None and finished:
+            lazily = saving.lazily(lengths.chains, held.draws) if spilled else None
+            checkpoint.finish(posterior, lazily)
         self._warn(posterior, sampler, finished, lengths)
         return posterior
 
@@ -210,13 +225,16 @@ class ChainEngine(Engine):
         """Draws made, until they are enough where it is an effective size that is asked for."""
         lengths = loop.lengths
         before, draws, wanted = held.draws, lengths.first(), lengths.ess
-        if (
+        if loop.round is not None:  # where another process was
+            before, draws = 0, loop.round - held.draws
+        elif (
             wanted is not None and before
         ):  # what is there has its own, and as much again is asked for
             wanted += wanted * reached(wanted, agree=False)
         while True:
-            if isinstance(held, Kept) and held.draws > before:
-                held.more(draws)
+            if loop.round is not None and held.draws + draws > loop.round:
+                held.more(draws) if isinstance(held, Kept) else None
+            loop.round = held.draws + draws
             if not loop.draw(state, held, draws, bar, stop):
                 return False
             done = held.draws - before
@@ -241,8 +259,14 @@ class ChainEngine(Engine):
         summed: bool,
         resume: Posterior | None,
         lengths: Lengths,
+        saving: SavedChains | None,
     ) -> Kept | RunningChains:
         """Where draws go: new, or with those of an earlier run in it."""
+        if saving is not None and not summed:
+            return saving.held(lengths.chains, lengths.first())
+        if saving is not None and saving.state is not None and "sums" in saving.state:
+            sums: RunningChains = saving.state["sums"]
+            return sums.with_model(problem.model)
         if isinstance(resume, ChainsSums):
             return resume._running.with_model(problem.model)
         if summed:
