@@ -6,6 +6,7 @@ scale that its owner changes with ``rescale``. None grows with the number of dra
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -244,6 +245,12 @@ class Sums:
             for name, turned in self._turned.items():
                 turned.add(values[name], weights)
         self.weight += weights[0].sum(), weights[0] @ weights[0]
+
+    def without_model(self) -> Sums:
+        """What can be saved of it: the same arrays, and no net."""
+        found = copy.copy(self)
+        found.model = None  # type: ignore[assignment]
+        return found
 
     @property
     def constant(self) -> frozenset[str]:

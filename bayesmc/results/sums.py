@@ -252,15 +252,15 @@ class RunningChains:
 
     def with_model(self, model: Model) -> RunningChains:
         """The same for another compilation of the same net, independent of this one."""
-        found = copy.deepcopy(self, {id(self._sums.model): model})
-        found._sums.model = model  # where it was without one
+        held = self._sums.model
+        found = copy.deepcopy(self, {} if held is None else {id(held): model})
+        found._sums.model = model
         return found
 
     def without_model(self) -> RunningChains:
         """What can be saved of it: the same arrays, and no net."""
         found = copy.copy(self)
-        found._sums = copy.copy(self._sums)
-        found._sums.model = None  # type: ignore[assignment]
+        found._sums = self._sums.without_model()
         return found
 
     def _prepare(self, values: Mapping[str, np.ndarray]) -> None:

@@ -165,7 +165,7 @@ class _Packer:
         if id(value) not in self._met:
             own = np.copy(value, order="K")  # no bits depend on an order of axes that got lost
             order = sorted(range(own.ndim), key=lambda k: (-own.strides[k], k))
-            flat = np.ascontiguousarray(own.transpose(order))
+            flat = np.array(own.transpose(order), order="C")
             self._rows.append([own.dtype.str, list(flat.shape), order, int(value.flags.writeable)])
             self.arrays.append(flat)
             self._met[id(value)] = len(self.arrays) - 1
@@ -199,9 +199,10 @@ class _Packer:
             return {"made": [self._place(reduced[0], where), state], **made}
         state = value.__getstate__()
         slots = None
-        if isinstance(state, tuple):
+        if isinstance(state, tuple) and kind.__getstate__ is object.__getstate__:
             state, slots = state
-        tree = self.of(dict(state or {}), where)
+        whole = state if isinstance(state, (list, tuple)) else dict(state or {})
+        tree = self.of(whole, where)
         both = [tree, None if slots is None else self.of(dict(slots), where)]
         return {"object": [self._place(kind, where), both], **made}
 

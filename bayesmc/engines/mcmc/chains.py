@@ -21,7 +21,7 @@ from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
 from bayesmc.engines.mcmc.question import difference
-from bayesmc.engines.mcmc.saved import SavedChains
+from bayesmc.engines.mcmc.saved import SavedChains, answer_so_far
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
@@ -212,6 +212,10 @@ class ChainEngine(Engine):
             checkpoint.finish(posterior, lazily)
         self._warn(posterior, sampler, finished, lengths)
         return posterior
+
+    def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
+        """What a run has come to that has not ended; None where that is nothing."""
+        return answer_so_far(self, problem, file)
 
     def _drawn(
         self,

@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesmc.engines.mcmc.loop import Begun, Kept, Loop, Point, State
 from bayesmc.network import Problem
-from bayesmc.results import Checkpoint, RunningChains
+from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, RunningChains
 from bayesmc.storage import Lazy, Saver
 
 #: numbers of draws that are held before they go into the file, where they are kept there
@@ -169,6 +169,29 @@ class SavedChains:
         window = Kept(loop.model, tuple(stored), loop.lengths.chains, room)
         window.begin_with(stored, saved["draws"])
         return window
+
+
+def answer_so_far(engine: Any, problem: Problem, saver: Saver) -> ChainsPosterior | ChainsSums | None:
+    """The posterior of the draws that were saved; None where there are none."""
+    saved = saver.state
+    if saved is None or saved["warming"]:
+        return None
+    known = {**problem.inputs, **{n: o.value for n, o in problem.observed.items() if o.mask is None}}
+    values = {**known, **saved["values"]}
+    point = Checkpoint(saved["state"], saved["generator"], values, problem.observed, {})
+    found: ChainsPosterior | ChainsSums
+    if "sums" in saved:
+        sums = saved["sums"].with_model(problem.model)
+        found = ChainsSums(problem, engine, sums, saved["acceptance"], saved["warmup"], point)
+    else:
+        shape = saved["chains"], saved["draws"]
+        found = ChainsPosterior(
+            problem, engine, stored_of(saver), shape, saved["acceptance"], saved["ensemble"],
+            saved["warmup"],
+        )  # fmt: skip
+        found.superchains = saved["superchains"]
+    found.checkpoint = None  # the run's own file goes on with it
+    return found
 
 
 def stored_of(saver: Saver) -> dict[str, np.ndarray]:

@@ -6,6 +6,7 @@ engine supplies the steps of a pass; how a step samples or weighs is not known h
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar
@@ -15,15 +16,16 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.categorical import log_sum_exp
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.base import Engine
+from bayesmc.engines.base import Engine, kept_names
 from bayesmc.engines.forward import chunk_sizes
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.weighted.saved import SavedDraws, SpilledDraws
 from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import Pass, Step, run
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
+from bayesmc.results import DrawsPosterior, Posterior, RunFile, Sums, SumsPosterior
 from bayesmc.results.chains import noted_densities
 
 #: share of the draws above which weights are even: they have a heavy tail only if the largest one counts
@@ -45,6 +47,7 @@ class WeightedEngine(Engine):
     """
 
     draws: int
+    saves: ClassVar[bool] = True
     #: what the engine does, in warnings and beside the progress bar
     label: ClassVar[str]
     #: what helps where the weights are too uneven
@@ -78,29 +81,58 @@ class WeightedEngine(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        checkpoint: RunFile | None = None,
     ) -> Posterior:
-        names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
+        names, summed, spilled = kept_names(keep, problem)
         steps, known = self.steps(problem), self.known(problem)
+        saving = None if checkpoint is None else SavedDraws(checkpoint, problem, names, spilled)
         with Progress(self.draws, self.label, progress) as bar:
             first = resume.streams if isinstance(resume, DrawsPosterior) else 0
             sizes = _sizes(problem.model, self.draws)
+            if saving is not None:
+                first, sizes = saving.chunks, itertools.islice(sizes, saving.chunks, None)
             chunks = _counted(passes(steps, sizes, seed, known, first), bar)
-            if isinstance(keep, str) and keep == "summaries":
+            if summed:
                 if resume is not None:
                     raise UnsupportedError('infer: resume= continues draws; give keep="draws"')
-                return self._summaries(problem, chunks, names)
-            kept = names if isinstance(keep, str) else tuple(keep)
-            try:
-                return self._draws(problem, chunks, kept, resume)
-            except MemoryError as error:
-                raise no_memory(self, self.draws, kept) from error
+                found: Posterior = self._summaries(problem, chunks, names, saving)
+            elif saving is not None and spilled:
+                return self._spilled(problem, chunks, saving)
+            else:
+                try:
+                    found = self._draws(problem, chunks, names, resume, saving)
+                except MemoryError as error:
+                    raise no_memory(self, self.draws, names) from error
+        if checkpoint is not None:
+            checkpoint.finish(found)
+        return found
+
+    def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
+        """What a run has come to that has not ended; None where that is nothing."""
+        saving = SavedDraws(file, problem, (), False)
+        if not saving.count or saving.state is None:
+            return None
+        weighted = self.is_weighted(problem)
+        if saving.state["sums"] is not None:
+            return SumsPosterior(problem, self, saving.sums(), weighted)
+        stored, log_weights = saving.stored()
+        given = log_weights if weighted else None
+        return DrawsPosterior(problem, self, stored, log_weights.shape, given, independent=True)
 
     def _summaries(
-        self, problem: Problem, chunks: Iterable[Pass], names: tuple[str, ...]
+        self,
+        problem: Problem,
+        chunks: Iterable[Pass],
+        names: tuple[str, ...],
+        saving: SavedDraws | None,
     ) -> SumsPosterior:
         sums = Sums(problem.model, names)
+        if saving is not None and saving.count:
+            sums = saving.sums()
         for chunk in chunks:
             sums.add(chunk.values, chunk.log_weight, chunk.batch[0])
+            if saving is not None:
+                saving.passed(sums)
         self._refuse_zero(sums.top, self.draws)
         weighted = self.is_weighted(problem)
         posterior = SumsPosterior(problem, self, sums, weighted)
@@ -114,12 +146,19 @@ class WeightedEngine(Engine):
         chunks: Iterable[Pass],
         names: Sequence[str],
         resume: Posterior | None,
+        saving: SavedDraws | None,
     ) -> DrawsPosterior:
         kept = Kept(problem.model, names, self.draws)
         log_weights = np.zeros((1, self.draws))
+        if saving is not None:
+            for values, logs, count in saving.earlier():
+                log_weights[0, kept.count : kept.count + count] = logs
+                kept.add(values, count)
         for chunk in chunks:
             log_weights[0, kept.count : kept.count + chunk.batch[0]] = chunk.log_weight
             kept.add(chunk.values, chunk.batch[0])
+            if saving is not None:
+                saving.drawn(chunk)
         stored = kept.stored
         if resume is not None:
             stored, log_weights = self._joined(resume, stored, log_weights, problem)
@@ -143,6 +182,38 @@ class WeightedEngine(Engine):
         posterior.densities = None if few is None else noted_densities(problem, few)
         log_total = float(log_sum_exp(log_weights))
         self._set_evidence(posterior, log_total, total, weighted, log_weights)
+        return posterior
+
+    def _spilled(
+        self, problem: Problem, chunks: Iterable[Pass], saving: SavedDraws
+    ) -> DrawsPosterior:
+        """Draws that are never here all at once: they stay in the file."""
+        for chunk in chunks:
+            saving.drawn(chunk)
+        saving.flush()
+        tail = saving.tail()
+        self._refuse_zero(tail.top, self.draws)
+        weighted = self.is_weighted(problem)
+        lazily = saving.lazily(self.draws, weighted, tail.top)
+        stand_ins = saving.stand_ins(lazily)
+        log_weights, weights = stand_ins.pop("log_weights", None), stand_ins.pop("weights", None)
+        posterior = SpilledDraws(
+            problem,
+            self,
+            stand_ins,
+            (1, self.draws),
+            independent=True,
+            streams=len(chunk_sizes(problem.model, self.draws)),
+        )
+        posterior.log_weights, posterior.weights = log_weights, weights
+        log_total = tail.top + float(np.log(tail.weight[0]))
+        if weighted:
+            posterior.weight_ess = float(tail.weight[0] ** 2 / tail.weight[1])
+            posterior.tail_pareto_k = tail.pareto_k
+        self._set_evidence(posterior, log_total, self.draws, weighted, tail.tail.values())
+        saving.saver.finish(posterior, lazily)
+        few = _first(posterior._stored, problem)
+        posterior.densities = None if few is None else noted_densities(problem, few)
         return posterior
 
     def _joined(
