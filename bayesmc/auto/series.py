@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.files import Opened
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
@@ -55,6 +56,7 @@ def filter(
     progress: bool | None = None,
     keep: str | None = None,
     queries: Queries | None = None,
+    checkpoint: Any = None,
 ) -> SeriesPosterior:
     """Beliefs about every slice given the rows up to it.
 
@@ -75,6 +77,9 @@ def filter(
         Name -> function of nodes of a slice, whose arguments have an axis of points, cells, states or
         particles first; its expectation in every slice is in ``.queries``, its standard error, where one is
         stated, in ``.queries_mcse``.
+    checkpoint : path or CheckpointFile, optional
+        A file in which a particle filter saves itself as the slices pass (the extra ``netcdf``), and other
+        filters their answer; the same call goes on where the run was, with the same bits (see ``infer``).
 
     Returns
     -------
@@ -83,6 +88,8 @@ def filter(
     Raises
     ------
     ModelError, EvidenceError, UnsupportedError, DegeneracyError
+    CheckpointError, DamagedFileError
+        The file is of another run, and the message says what differs; the disk is full; or it was cut off.
 
     Warns
     -----
@@ -102,9 +109,22 @@ def filter(
     (3,)
     """
     problem = pose_series(dbn, observations, inputs)
+    opened = None if checkpoint is None else Opened("filter", checkpoint, problem)
+    engine = opened.engine if engine is None and opened is not None else engine
     chosen = _engine(problem, engine, Asked("filter", keep, read_queries("filter", queries)))
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
-    return chosen.filter(problem, seed_sequence(rng), **options)
+    if opened is None:
+        return chosen.filter(problem, seed_sequence(rng), **options)
+    seed = opened.seed(rng)
+    file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
+    if file is None:
+        return answer
+    if chosen.saves:
+        return chosen.filter(problem, seed, **options, checkpoint=file)
+    found = chosen.filter(problem, seed, **options)
+    if not getattr(found, "interrupted", False):
+        file.finish(found)
+    return found
 
 
 def smooth(

@@ -6,6 +6,7 @@ belief=...)`` has given it the template again.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, DynamicBayesNet, Row, Slices
 from bayesmc.errors import ModelError, QueryError
 from bayesmc.network import CompiledNode, Model
-from bayesmc.results import SeriesPosterior
+from bayesmc.results import SeriesPosterior, save
 
 
 class OnlineBelief:
@@ -26,6 +27,15 @@ class OnlineBelief:
 
     def __deepcopy__(self, memo: Any) -> Any:
         return self
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file; it goes on with ``engine.start(dbn, belief=bmc.load(path))``.
+
+        Raises
+        ------
+        MissingExtraError, CheckpointError
+        """
+        save(self, path)
 
 
 class SliceBelief(OnlineBelief):

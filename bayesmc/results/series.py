@@ -7,6 +7,7 @@ out while the slices passed by. What a family keeps besides (particles, joint co
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_y
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import quantile_levels, table_variance
 from bayesmc.results.predictive import Predictive
+from bayesmc.results.saving import save
 
 #: what is asked of answers over time that has another name here, or that only some filters have
 _INSTEAD = {
@@ -318,6 +320,27 @@ class SeriesPosterior:
             found.mean_errors = cut(self.mean_errors)
         found.queries_mcse = cut(self.queries_mcse)
         return found
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file that ``bmc.load`` reads, and xarray: as ``Posterior.save`` does.
+
+        Means, variances and probabilities stand under ``answers``, time first.
+
+        Raises
+        ------
+        MissingExtraError, CheckpointError
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], initial=[0.5, 0.5])
+        >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+        >>> bmc.filter(dbn, {"umbrella": [1, 1]}).save("rain.nc")  # doctest: +SKIP
+        >>> bmc.load("rain.nc").probabilities("rain").shape  # doctest: +SKIP
+        (2, 2)
+        """
+        save(self, path)
 
     def __copy__(self) -> Any:
         """The same answers; unlike a pickle a copy keeps the model's functions."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import enum
+import functools
 import json
 import sys
 import types
@@ -179,6 +180,12 @@ class _Packer:
             if value.__module__.startswith(_HOME) and value.__qualname__.isidentifier():
                 return {"function": self._place(value, where)}
             raise self._refusal(value, where)
+        if isinstance(value, types.MethodType) and not isinstance(value.__self__, type):
+            if not value.__name__.startswith("__"):
+                return {"method": [self.of(value.__self__, where), value.__name__]}
+        if isinstance(value, functools.partial):
+            parts = value.func, value.args, value.keywords
+            return {"partial": [self.of(p, where) for p in parts]}
         kind = type(value)
         if isinstance(value, tuple) and hasattr(value, "_fields"):
             items = [self.of(v, f"{where}.{n}") for n, v in zip(value._fields, value, strict=True)]
@@ -316,6 +323,18 @@ class _Unpacker:
         if not isinstance(found, types.FunctionType) or not found.__module__.startswith(_HOME):
             raise FileFormatError(f"there is no function {place}")
         return found
+
+    def _method(self, parts: Any, _: Any) -> Any:
+        holder, name = self.of(parts[0]), parts[1]
+        found = getattr(type(holder), name, None)
+        ours = isinstance(found, types.FunctionType) and found.__module__.startswith(_HOME)
+        if name.startswith("__") or not ours:
+            raise FileFormatError(f"there is no method {name!r}")
+        return getattr(holder, name)
+
+    def _partial(self, parts: Any, _: Any) -> Any:
+        function, arguments, keywords = (self.of(p) for p in parts)
+        return functools.partial(function, *arguments, **keywords)
 
     def _enum(self, parts: Any, _: Any) -> Any:
         return _class(parts[0])[parts[1]]

@@ -49,7 +49,9 @@ from bayesmc.engines.particles.options import (
     warn_of_what_is_not_guided,
     without_functions,
 )
-from bayesmc.engines.particles.record import FilteredParticles, filtered_by
+from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.engines.particles.run import filtered_by
+from bayesmc.engines.particles.runs import run_of
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
 from bayesmc.engines.particles.smoothing import Backwards, backwards
@@ -203,6 +205,7 @@ class ParticleFilter(FilterEngine):
 
     label: ClassVar[str] = "particle filter"
     keeps: ClassVar[bool] = True
+    saves: ClassVar[bool] = True
     belief: ClassVar[type] = ParticleBelief
 
     def __post_init__(self) -> None:
@@ -280,6 +283,7 @@ class ParticleFilter(FilterEngine):
         keep: str | None = None,
         queries: Queries | None = None,
         progress: bool | None = None,
+        checkpoint: RunFile | None = None,
     ) -> FilteredParticles:
         if keep not in (None, "particles"):
             raise ValueError(
@@ -288,12 +292,8 @@ class ParticleFilter(FilterEngine):
         if not self._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
-            sized = self._sized(self._enough(problem, seed, keep is not None, progress))
             whole = keep is not None, queries or {}, progress
-            if self.delay is None:
-                found = filtered = sized._passed(problem, seed, *whole)
-            else:
-                found, filtered = by_lag(sized, problem, seed, self.delay, *whole, "filter")
+            found, filtered = run_of(self, problem, seed, *whole, checkpoint)
         except KeyboardInterrupt as stop:
             found = filtered = answer_so_far(stop, self)
         warn_of_errors(filtered, self)
@@ -400,14 +400,16 @@ class ParticleFilter(FilterEngine):
         queries: Queries,
         progress: bool | None,
         unit: int = 0,
+        saver: Saver | None = None,
     ) -> FilteredParticles:
         """All slices, one by one."""
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
         step = self.step_of(problem.slices, problem.known_static, kept, problem.seen)
         if not step.integrated:
-            step = compiled_step(step, problem.steps, self.compiled)
-        return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
+            compiled = self.compiled if saver is None else saver.state["compiled"]
+            step = compiled_step(step, problem.steps, compiled)
+        return filtered_by(self, step, problem, seed, keep, queries, progress, unit, saver=saver)
 
     def _integrates(self, problem: SeriesProblem) -> bool:
         """Whether anything is integrated out."""

@@ -1,4 +1,4 @@
-"""The run of a filter over a series, and what it keeps: answers of constant size, or the particles."""
+"""What the run of a filter over a series keeps: answers of constant size, or the particles."""
 
 from __future__ import annotations
 
@@ -23,20 +23,28 @@ from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.made import Ahead, MadeSlices
-from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Layout, Particles, quiet
 from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written
+from bayesmc.engines.particles.written import (
+    KINDS,
+    Rows,
+    Waiting,
+    Written,
+    count,
+    joined,
+    last_rows,
+    together,
+)
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
-from bayesmc.progress import Progress
-from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
 #: slices that are written together, at most, and those that are though half as many would stay in cache
 TOGETHER, FEW = 100, 6
+#: what waits to be written
+_UNSETTLED = ("_waiting", "_most", "_tallies", "_figures", "_summed")
 
 
 class Record:
@@ -121,7 +129,7 @@ class Record:
         if earlier and not self.keep:
             earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
             if len(earlier) - self._packed >= TOGETHER:  # many small arrays hold more than one
-                earlier = [*earlier[: self._packed], _packed(earlier[self._packed :])]
+                earlier = [*earlier[: self._packed], together(earlier[self._packed :])]
                 self._packed += 1
         self._written, self._waiting = [*earlier, worked_out], []
         self._tallies, self._figures, self._summed = [], [], []
@@ -243,6 +251,28 @@ class Record:
         rows["query errors"] |= {name: held.mcse(f) for name, f in self.asked.items()}
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
+    # ---- what is saved of it ---------------------------------------------------------------------
+
+    def written_since(self, slices: int) -> list[Written]:
+        """What is written of the slices from one on, but for the last piece, which is ``unsettled``."""
+        found, first = [], 0
+        for piece in self._written[:-1]:
+            end = first + count(piece)
+            if end > slices:
+                found.append(last_rows(piece, max(slices - first, 0)))
+            first = end
+        return found
+
+    def unsettled(self) -> dict[str, Any]:
+        """All else, which is yet to change."""
+        return {name: getattr(self, name) for name in _UNSETTLED} | {"last": self._written[-1:]}
+
+    def go_on(self, written: Sequence[Written], unsettled: Mapping[str, Any]) -> None:
+        """Be where another record was."""
+        for name in _UNSETTLED:
+            setattr(self, name, unsettled[name])
+        self._written, self._packed = [*written, *unsettled["last"]], len(written)
+
     # ---- private -------------------------------------------------------------------------------
 
     def _together(self, particles: Particles) -> int:
@@ -260,7 +290,7 @@ class Record:
         return self.tracker.after(self.families, earlier, block, rows)
 
     def _joined(self, what: str, steps: int) -> dict[str, np.ndarray]:
-        return first_slices(_joined(self._written, what), steps)
+        return first_slices(joined(self._written, what), steps)
 
 
 class FilteredParticles(SeriesPosterior):
@@ -382,69 +412,3 @@ class FilteredParticles(SeriesPosterior):
         if self.held is None:
             raise self._not_kept(what)
         return self.held
-
-
-def filtered_by(
-    engine: Any,
-    step: FilterStep,
-    problem: SeriesProblem,
-    seed: np.random.SeedSequence,
-    keep: bool,
-    queries: Queries,
-    progress: bool | None,
-    unit: int = 0,
-    look_back: Callable[[int, Particles, Families], None] | None = None,
-    names: Sequence[str] | None = None,
-) -> FilteredParticles:
-    """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
-
-    Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows. There are
-    answers about some nodes, or all that are hidden.
-    """
-    record = Record(problem, step.layout, queries, keep, Tracker(step), names)
-    rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    looks = Replicates(problem, step.plan, check) if unit == 0 else None
-    now: Particles | None = None
-    is_ahead = step.machine is not None and look_back is None
-    ahead = Ahead(step.machine, problem, record) if is_ahead else None
-
-    def move(k: int) -> None:
-        nonlocal now
-        if ahead is not None and ahead.reaches(k, now, rng):
-            now = ahead.passed(k, looks)
-            return
-        row, old = problem.series.row(k), now
-        if looks is not None:
-            looks.look(k, old, row)
-        now = step(old, row, rng)
-        record.add(k, now, row)
-        if look_back is not None:
-            record.write()
-            assert record.families is not None
-            look_back(k, now, record.families)
-        if old is not None and not keep and look_back is None and record.is_written:
-            step.recycle(old)
-
-    def so_far(steps: int) -> FilteredParticles:
-        if ahead is not None:
-            ahead.stop(steps)
-        return record.posterior(engine, "filter", steps)
-
-    with Progress(problem.steps, engine.label, progress) as bar, quiet():
-        pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
-        return record.posterior(engine, predictive=None if looks is None else looks.found())
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
-    """Arrays of one kind, of all slices that are written."""
-    names = {n: None for w in written for n in w.rows[what]}
-    pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
-    return {n: np.concatenate(rows) for n, rows in pieces.items()}
-
-
-def _packed(written: Sequence[Written]) -> Written:
-    """Slices without their particles, as one."""
-    return Written({what: _joined(written, what) for what in KINDS}, [], [])

@@ -12,7 +12,8 @@ from bayesmc.engines.filtering import Queries
 from bayesmc.engines.marginal.smoothing import MarginalBackward, why_not_backwards
 from bayesmc.engines.particles.backward import TRAJECTORIES, Backward
 from bayesmc.engines.particles.coalescence import Sharing
-from bayesmc.engines.particles.record import FilteredParticles, Record, filtered_by
+from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.smc import quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.randomness import Purpose, stream

@@ -111,7 +111,8 @@ class SavedDraws:
         if not self._waiting:
             return
         count = sum(c for _, _, c in self._waiting)
-        rows: dict[str, Any] = {"draws": count, "moving": {}, "still": {}}
+        sizes = [c for _, _, c in self._waiting]
+        rows: dict[str, Any] = {"draws": count, "sizes": sizes, "moving": {}, "still": {}}
         for name in self.names:
             parts = [values[name] for values, _, _ in self._waiting]
             still = parts[0].ndim == len(self.problem.model[name].value_shape)
@@ -148,9 +149,14 @@ class SavedDraws:
     def tail(self) -> WeightTail:
         """What is to be known of the weights."""
         found = WeightTail()
-        for rows in self.saver.rows():
-            found.add(rows["log_weights"])
+        for piece in self._log_weights():
+            found.add(piece)
         return found
+
+    def _log_weights(self) -> Iterator[np.ndarray]:
+        """Chunk by chunk, so that no sum of them depends on when they were saved."""
+        for rows in self.saver.rows():
+            yield from np.split(rows["log_weights"], np.cumsum(rows["sizes"])[:-1])
 
     def lazily(self, draws: int, weighted: bool, top: float) -> dict[str, Any]:
         """The draws, as arrays that are read block by block; constants as they are."""
@@ -187,6 +193,6 @@ class SavedDraws:
 
     def _weights(self, top: float) -> Iterator[tuple[Any, np.ndarray]]:
         """Weights that sum to one."""
-        total = sum(float(np.exp(piece - top).sum()) for _, piece in self._pieces("log_weights"))
+        total = sum(float(np.exp(piece - top).sum()) for piece in self._log_weights())
         for at, piece in self._pieces("log_weights"):
             yield at, np.exp(piece - top) / total
