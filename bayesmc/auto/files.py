@@ -6,6 +6,7 @@ import importlib.util
 import os
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -70,6 +71,7 @@ def load(
     >>> bmc.load("exact.nc").mean("x")  # doctest: +SKIP
     0.5
     """
+    path = Path(path)
     image = open_image(path)
     kind = image.attributes.get("kind")
     if kind == RUN:
@@ -105,8 +107,8 @@ class Opened:
             self.header = unpacked(self.image.packed, _nothing)["header"]
             if not self.header or "identity" not in self.header:
                 raise CheckpointError(
-                    f"{call}(checkpoint={str(self.path)!r}): the file holds an answer that was saved, and no run; "
-                    "give another path (bmc.load reads it)"
+                    f"{call}(checkpoint={str(self.path)!r}): the file holds an answer that was saved, and "
+                    "no run; give another path (bmc.load reads it)"
                 )
 
     @property
@@ -143,11 +145,12 @@ class Opened:
             header = self.header
             if why := _difference(header["identity"], identity):
                 raise CheckpointError(
-                    f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; make the "
-                    "same call to go on with it, or give another path"
+                    f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; "
+                    "make the same call to go on with it, or give another path"
                 )
             if self.image is not None and self.image.attributes["kind"] == ANSWER:
-                return Begun(None, self._answer(keep))
+                with suppress(UnsupportedError):  # of an approximation, which is made again
+                    return Begun(None, self._answer(keep))
         return Begun(RunFile(self.file, header), None)
 
     # ---- private -------------------------------------------------------------------------------
@@ -222,7 +225,11 @@ def _identity(
     found["the seed (rng=)"] = key
     found |= {f"{n}=": _shown(v) for n, v in more.items()}
     fast = importlib.util.find_spec("llvmlite") is not None
-    versions = {"numpy": np.__version__, "scipy": scipy.__version__, "Python": platform.python_version()}
+    versions = {
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "Python": platform.python_version(),
+    }
     found |= {f"the version of {n}": f"={v}" for n, v in versions.items()}
     found["machine code (the extra fast)"] = "=there" if fast else "=not there"
     return found
@@ -252,7 +259,7 @@ def _difference(was: Fingerprint, now: Fingerprint) -> str | None:
 def _so_far(path: Any) -> tuple[Any, Mapping[str, Any]]:
     """What a run has come to that has not ended."""
     header = unpacked(open_image(path).packed)["header"]
-    run = RunFile(CheckpointFile(path), header)
+    run = RunFile(CheckpointFile(path), header, alone=False)
     engine = header["engine"]
     answer = None
     if hasattr(engine, "so_far") and "model" in header:
@@ -273,17 +280,19 @@ def _with_net(path: Any, answer: Any, header: Mapping[str, Any], net: Any) -> An
             f"load(net=): a {type(answer).__name__} answers without a net; a belief goes on with "
             "engine.start(dbn, belief=bmc.load(path))"
         )
-    inputs = {n: v for n, v in getattr(answer, "_known", {}).items()}
+    inputs = dict(getattr(answer, "_known", {}))
     evidence = {n: _given(answer.model[n], o) for n, o in answer._seen.items()}
     if isinstance(net, DynamicBayesNet):
         raise ModelError(
             "load(net=): the answer is about an unrolled net; give net=dbn.unroll(steps), with its inputs"
         )
     problem = pose_any(net, evidence, inputs or None)
-    was = {k: v for k, v in header.get("fingerprint", header.get("identity", {})).items()}
+    was = header.get("fingerprint", header.get("identity", {}))
     now = fingerprint(problem.model)
     if why := _difference({k: v for k, v in was.items() if k in now}, now) if was else None:
-        raise CheckpointError(f"load({str(path)!r}, net=...): the answer is about another net: {why}")
+        raise CheckpointError(
+            f"load({str(path)!r}, net=...): the answer is about another net: {why}"
+        )
     answer.bind(problem)
     return answer
 

@@ -120,7 +120,7 @@ def filter(
     if file is None:
         return answer
     if chosen.saves:
-        return chosen.filter(problem, seed, **options, checkpoint=file)
+        return chosen.filter(problem, seed, **options, checkpoint=file)  # type: ignore[call-arg]
     found = chosen.filter(problem, seed, **options)
     if not getattr(found, "interrupted", False):
         file.finish(found)

@@ -207,7 +207,8 @@ def _run_saved(opened: Opened, engine: Any, rng: Any, keep: Any, progress: bool 
     """The answer of a run that is saved as it goes on."""
     if (keep == "file" or isinstance(keep, Mapping)) and not engine.saves:
         raise UnsupportedError(
-            f"infer(keep={keep!r}): {type(engine).__name__} makes no draws that could stay in a file; leave keep= out"
+            f"infer(keep={keep!r}): {type(engine).__name__} makes no draws that could stay in a file; leave "
+            "keep= out"
         )
     seed = opened.seed(rng)
     file, answer = opened.begin(engine, seed, keep, {})
@@ -252,7 +253,9 @@ def _with_alternative(reason: str, engine: Any, problem: Problem) -> str:
 
 
 def _check_keep(keep: Any, problem: Problem, checkpoint: Any) -> None:
-    choices = 'give "draws", "summaries", "file", a list of node names, or {"file": a list of node names}'
+    choices = (
+        'give "draws", "summaries", "file", a list of node names, or {"file": a list of node names}'
+    )
     in_file = keep == "file" or (isinstance(keep, Mapping) and [*keep] == ["file"])
     if in_file and checkpoint is None:
         raise ValueError(f'infer(keep={keep!r}): in which file? give checkpoint="run.nc"')

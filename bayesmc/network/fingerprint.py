@@ -1,8 +1,8 @@
 """Fingerprints: what a question is, in a form that another process can compare with its own.
 
-A function is told by the graph of what it computes, with what it read from around it as numbers in it; one that
-cannot be followed by its code, and by what that reads. So a net that is declared anew by the same lines has the
-same fingerprint, and one that says something else has another, in the place where it does.
+A function is told by the graph of what it computes, with what it read from around it as numbers in it; one
+that cannot be followed by its code, and by what that reads. So a net that is declared anew by the same
+lines has the same fingerprint, and one that says something else has another, in the place where it does.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _of_code(function: types.FunctionType) -> Iterator[Any]:
 
 
 def _of_graph(root: Expression, met: dict[int, Any], depth: int) -> Iterator[bytes]:
-    number = {}
+    number: dict[Expression, int] = {}
     for node in ordered(root):
         number[node] = len(number)
         operands = [number[o] for o in node.operands]

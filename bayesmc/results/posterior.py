@@ -349,8 +349,8 @@ class Posterior:
         """Write it to a file that ``bmc.load`` reads, and ArviZ and xarray, too.
 
         It is NetCDF-4 (the extra ``netcdf``). Draws are under ``posterior``, weighted ones under
-        ``weighted_posterior``; of answers without draws, means, variances and probabilities under ``answers``.
-        The file takes the place of another one at once or not at all. Functions stay out.
+        ``weighted_posterior``; of answers without draws, means, variances and probabilities under
+        ``answers``. The file takes the place of another one at once or not at all. Functions stay out.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Posteriors and beliefs in files: what ArviZ and xarray read of them, and all that loading needs.
 
-Draws stand once, under ``posterior`` (``weighted_posterior`` with their weights, which ArviZ would not know of); a
-finite node's as the positions of its states, with what these mean as an attribute, and numbers of states packed
-the way NetCDF packs numbers. Answers without draws stand node by node under ``answers``.
+Draws stand once, under ``posterior`` (``weighted_posterior`` with their weights, which ArviZ would not know
+of); a finite node's as the positions of its states, with what these mean as an attribute, and numbers of
+states packed the way NetCDF packs numbers. Answers without draws stand node by node under ``answers``.
 """
 
 from __future__ import annotations
@@ -198,9 +198,7 @@ def _elsewhere(answer: Any, lazily: Mapping[str, Any] | None) -> dict[int, str]:
 
 def _is_positional(node: CompiledNode) -> bool:
     """Whether positions say the states, by a formula or by what they mean."""
-    return node.domain is not None and (
-        node.domain.labels is not None or _even(node)[1] != 0.0
-    )
+    return node.domain is not None and (node.domain.labels is not None or _even(node)[1] != 0.0)
 
 
 def _even(node: CompiledNode) -> tuple[float, float]:
@@ -227,7 +225,7 @@ def _answers(answer: Any, model: Model) -> dict[str, Variable]:
             ("var", answer.var, ()),
             ("probabilities", answer.probabilities, (f"{name}_state",)),
         ):
-            if (what == "probabilities") == (node.domain is None):
+            if what == "probabilities" and node.domain is None:
                 continue
             try:
                 value = np.asarray(ask(name), dtype=float)

@@ -1,8 +1,9 @@
 """Blocks of a run, appended behind an image: what is there stays there, whatever happens to the process.
 
-A block is a head (a mark, a number, a length, two checksums) and packed bytes, on the disk before the image says
-that the file reaches so far. What lies behind that was on its way when the process ended, and is no block; where
-the file ends before, it was cut off, and the blocks that are whole are known by their checksums.
+A block is a head (a mark, a number, a length, two checksums) and packed bytes, on the disk before the image
+says that the file reaches so far. What lies behind that was on its way when the process ended, and is no
+block; where the file ends before, it was cut off, and the blocks that are whole are known by their
+checksums.
 """
 
 from __future__ import annotations
@@ -16,6 +17,11 @@ from typing import Any, NamedTuple
 
 from bayesmc.errors import CheckpointError, DamagedFileError
 from bayesmc.storage.image import open_image, replacing, set_end
+
+try:
+    import fcntl
+except ImportError:  # not on this system
+    fcntl = None  # type: ignore[assignment]
 
 _MARK = b"bmcBLOCK"
 #: mark, kind, number, length, checksum of what follows, checksum of the head
@@ -49,6 +55,8 @@ class Blocks:
         Of an image that is there.
     repair : bool
         Take the blocks that are whole of a file that is damaged.
+    alone : bool
+        Let no other process add blocks, as long as this object lives.
 
     Raises
     ------
@@ -56,8 +64,9 @@ class Blocks:
         The file is cut off, or a block is not what was written; ``blocks`` says how many are whole.
     """
 
-    def __init__(self, path: str | Path, repair: bool = False) -> None:
+    def __init__(self, path: str | Path, repair: bool = False, alone: bool = False) -> None:
         self.path = Path(path)
+        self._lock = Lock(self.path) if alone else None
         self.image = open_image(path)
         self._end = self.image.end
         self.blocks = self._found(repair)
@@ -95,7 +104,7 @@ class Blocks:
         """
         added: list[Block] = []
         try:
-            handle = os.open(self.path, os.O_RDWR)
+            handle = os.open(self.path, os.O_RDWR | getattr(os, "O_BINARY", 0))
             try:
                 end = self._end
                 for kind, parts in ((ROWS, rows), (STATE, state)):
@@ -130,7 +139,11 @@ class Blocks:
                 block = _read(file, at, len(found), min(size, self._end))
                 if block is None:
                     why = f"it is cut off: {size} of {self._end} bytes are there"
-                    why = why if size < self._end else f"bytes behind {at} are not those that were written"
+                    why = (
+                        why
+                        if size < self._end
+                        else f"bytes behind {at} are not those that were written"
+                    )
                     break
                 found.append(block)
                 at = _next(block.end)
@@ -140,18 +153,17 @@ class Blocks:
             found.pop()
         count = sum(b.kind == STATE for b in found)
         if not repair:
-            raise DamagedFileError(
-                f"{self.path}: {why}. {count or 'None'} of its blocks {'is' if count == 1 else 'are'} whole"
-                + (
-                    f"; to go on from the last of them, give checkpoint=bmc.CheckpointFile({str(self.path)!r}, "
-                    "repair=True)"
-                    if count
-                    else "; move it away and call again"
-                ),
-                count,
-            )
+            raise DamagedFileError(f"{self.path}: {why}. {self._remedy(count)}", count)
         self._end = found[-1].end if found else self.image.size
         return found
+
+    def _remedy(self, count: int) -> str:
+        """How to go on where so many blocks are whole."""
+        if not count:
+            return "None of its blocks is whole; move it away and call again"
+        whole = "One of its blocks is whole" if count == 1 else f"{count} of its blocks are whole"
+        again = f"bmc.CheckpointFile({str(self.path)!r}, repair=True)"
+        return f"{whole}; to go on from the last of them, give checkpoint={again}"
 
     def _tidy(self) -> None:
         """Write the file anew where most of it is states that are void."""
@@ -162,14 +174,18 @@ class Blocks:
         kept = [b for b in self.blocks if b.kind == ROWS] + [self.blocks[-1]]
         moved, end = [], self.image.size
         try:
-            with replacing(self.path) as new, open(self.path, "rb") as old, open(new, "r+b") as file:
+            with (
+                replacing(self.path) as new,
+                open(self.path, "rb") as old,
+                open(new, "r+b") as file,
+            ):
                 _copy(old, 0, file, 0, self.image.size)
                 for number, block in enumerate(kept):
                     old.seek(block.at)
                     head = list(_HEAD.unpack(old.read(_HEAD.size)))
                     moved.append(Block(block.kind, _next(end), block.length))
                     file.seek(moved[-1].at)
-                    file.write(_head(*head[1:2], number, *head[3:5]))
+                    file.write(_head(head[1], number, head[3], head[4]))
                     _copy(old, block.at + SIZE, file, moved[-1].at + SIZE, block.length)
                     end = moved[-1].end
                 file.flush()
@@ -177,13 +193,44 @@ class Blocks:
         except OSError:  # there is no room for both: the file stays as it is
             return
         self.blocks, self._end = moved, end
+        if self._lock is not None:
+            self._lock = Lock(self.path)
+
+
+class Lock:
+    """Keeps other processes from adding to a file as long as it lives; readers are not kept out.
+
+    Raises
+    ------
+    CheckpointError
+        Another one does.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._handle = os.open(path, os.O_RDWR)
+        if not hasattr(fcntl, "F_OFD_SETLK"):  # there is none on this system
+            return
+        whole = struct.pack("hhqqi4x", fcntl.F_WRLCK, 0, 0, 0, 0)
+        try:
+            fcntl.fcntl(self._handle, fcntl.F_OFD_SETLK, whole)
+        except BlockingIOError:
+            raise CheckpointError(
+                f"{path}: another process is running this, and saves itself there; wait for it, or give "
+                "another path"
+            ) from None
+        except OSError:  # a file system without locks
+            pass
+
+    def __del__(self) -> None:
+        if hasattr(self, "_handle"):
+            os.close(self._handle)
 
 
 def refused(path: Path, error: OSError) -> CheckpointError:
     """What is said of a disk that takes no more."""
     return CheckpointError(
-        f"{path}: {error.strerror or error}; what was saved before is whole, and the same call goes on from there "
-        "once there is room"
+        f"{path}: {error.strerror or error}; what was saved before is whole, and the same call goes on from "
+        "there once there is room"
     )
 
 
@@ -214,9 +261,9 @@ def _append(handle: int, at: int, kind: bytes, number: int, parts: Sequence[Any]
 
 def _write_all(handle: int, data: Any, at: int) -> None:
     view = memoryview(data).cast("B") if len(data) else memoryview(b"")
+    os.lseek(handle, at, os.SEEK_SET)
     while len(view):
-        count = os.pwrite(handle, view[: 1 << 30], at)
-        view, at = view[count:], at + count
+        view = view[os.write(handle, view[: 1 << 30]) :]
 
 
 def _read(file: Any, at: int, number: int, limit: int) -> Block | None:

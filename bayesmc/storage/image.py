@@ -1,12 +1,14 @@
 """Images: NetCDF files that are written whole and put in place at once.
 
-NetCDF is HDF5 with names for axes: ``xarray.open_datatree(path)`` and ArviZ read it. Ours has one group besides
-(``bayesmc``), which holds what was saved as packed bytes, and says how far the blocks behind it reach.
+NetCDF is HDF5 with names for axes: ``xarray.open_datatree(path)`` and ArviZ read it. Ours has one group
+besides (``bayesmc``), which holds what was saved as packed bytes, and says how far the blocks behind it
+reach.
 """
 
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -107,9 +109,9 @@ def write_image(
         The disk is full, or may not be written; what was there is left as it is.
     """
     path = Path(path)
-    with replacing(path) as new:
-        h5py, h5netcdf = libraries()
-        with h5netcdf.File(new, "w") as file:
+    h5py, h5netcdf = libraries()
+    with replacing(path) as new, _Patient(new) as raw_file:
+        with h5netcdf.File(raw_file, "w") as file:
             for name, group in groups.items():
                 _write_group(h5py, file.create_group(name), group)
             ours = file.create_group(GROUP)
@@ -126,6 +128,7 @@ def write_image(
             end = ours.create_variable(END, ("reach",), np.int64)._h5ds
             end[...] = 0
             where = int(end.id.get_offset())
+        raw_file.settle()
         with open(new, "r+b", buffering=0) as raw:
             size = os.fstat(raw.fileno()).st_size
             set_end(raw.fileno(), where, size)
@@ -243,12 +246,97 @@ def replacing(path: Path) -> Iterator[str]:
             os.close(folder)
 
 
+def clear_leftovers(path: Path) -> None:
+    """Remove what processes that were killed left of files that were to take the place of this one."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.new"):
+        with contextlib.suppress(OSError):
+            left.unlink()
+
+
 def set_end(handle: int, where: int, end: int) -> None:
     """Say how far a file reaches: eight bytes, which are there whole or not at all."""
-    os.pwrite(handle, int(end).to_bytes(8, "little"), where)
+    os.lseek(handle, where, os.SEEK_SET)
+    os.write(handle, int(end).to_bytes(8, "little"))
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+class _Patient:
+    """A file that takes all that is written, and says in the end what went wrong.
+
+    HDF5 does not survive a disk that is full: it fails again and again as it closes its file, and may take
+    the process with it.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._file = open(path, "r+b", buffering=0)  # noqa: SIM115 - closed on the way out
+        self._error: OSError | None = None
+        self._size = self._at = 0
+
+    def settle(self) -> None:
+        """Raise what went wrong.
+
+        Raises
+        ------
+        OSError
+        """
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> _Patient:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        self._file.close()
+        if self._error is not None and error is not self._error:
+            raise self._error
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        try:
+            at = self._at
+            while self._error is None and at < self._at + len(view):
+                self._file.seek(at)
+                at += self._file.write(view[at - self._at :]) or 0
+        except OSError as error:
+            self._error = error
+        self._at += len(view)
+        self._size = max(self._size, self._at)
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        self._file.seek(self._at)
+        count = self._file.readinto(view) or 0
+        view[count:] = bytes(len(view) - count)
+        self._at += len(view)
+        return len(view)
+
+    def read(self, count: int) -> bytes:
+        data = bytearray(count)
+        self.readinto(data)
+        return bytes(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = offset + (0, self._at, self._size)[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._at if size is None else size
+        try:
+            if self._error is None:
+                self._file.truncate(size)
+        except OSError as error:
+            self._error = error
+        self._size = size
+        return size
+
+    def flush(self) -> None:
+        """There is nothing that waits."""
 
 
 @contextmanager

@@ -1,8 +1,9 @@
 """Values as text and arrays, and back: what stands in a file of ours is data and never code.
 
-A tree of numbers, strings, containers and arrays, and objects of classes of bayesmc by what they say of their
-state (``__getstate__``, so that functions stay out as they do of pickles). Reading makes no other objects, and
-calls nothing but these classes' own ``__setstate__``; whoever writes a file cannot have it run anything.
+A tree of numbers, strings, containers and arrays, and objects of classes of bayesmc by what they say of
+their state (``__getstate__``, so that functions stay out as they do of pickles). Reading makes no other
+objects, and calls nothing but these classes' own ``__setstate__`` and constructors; whoever writes a file
+cannot have it run anything.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ def packed(value: Any, elsewhere: Mapping[int, str] | None = None) -> list[bytes
         gap = -at % ALIGNED
         parts.append(b"\0" * gap)
         if array.nbytes:
-            parts.append(memoryview(array.reshape(-1).view(np.uint8)))
+            parts.append(array.reshape(-1).view(np.uint8).data)
         at += gap + array.nbytes
     return parts
 
@@ -119,7 +120,9 @@ class _Packer:
             return items if kind is list else {"tuple": items}
         if kind in (dict, types.MappingProxyType):
             name = "dict" if kind is dict else "proxy"
-            return {name: [[self.of(k, where), self.of(v, f"{where}[{k!r}]")] for k, v in value.items()]}
+            return {
+                name: [[self.of(k, where), self.of(v, f"{where}[{k!r}]")] for k, v in value.items()]
+            }
         found = self._simple(value, where)
         return self._object(value, where) if found is None else found
 
@@ -152,7 +155,9 @@ class _Packer:
             return {"ufunc": value.__name__}
         if isinstance(value, np.random.SeedSequence):
             state = value.state
-            return {"seed": [self.of(state[k], where) for k in ("entropy", "spawn_key", "pool_size")]}
+            return {
+                "seed": [self.of(state[k], where) for k in ("entropy", "spawn_key", "pool_size")]
+            }
         return None
 
     def _array(self, value: np.ndarray, where: str) -> Any:
@@ -401,7 +406,11 @@ def _class(place: str) -> Any:
     found = _found(place)
     if place in ("builtins:int", "builtins:float", "builtins:bool", "builtins:str"):
         return found
-    if not isinstance(found, type) or not place.startswith(_HOME) or found.__module__ != place.partition(":")[0]:
+    if (
+        not isinstance(found, type)
+        or not place.startswith(_HOME)
+        or found.__module__ != place.partition(":")[0]
+    ):
         raise FileFormatError(
             f"there is no class {place}; the file was written by another version of bayesmc"
         )

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from bayesmc.storage.blocks import Blocks
+from bayesmc.storage.image import clear_leftovers
 from bayesmc.storage.packing import packed, unpacked
 
 #: time between two blocks, in units of what saving the last one took
@@ -68,11 +69,15 @@ class Saver:
     file : CheckpointFile
     header : dict
         What the file says of the run.
+    alone : bool
+        Let no other process save there.
     """
 
-    def __init__(self, file: CheckpointFile, header: Mapping[str, Any]) -> None:
+    def __init__(self, file: CheckpointFile, header: Mapping[str, Any], alone: bool = True) -> None:
         self.path, self.every, self.header = Path(file.path), float(file.every), header
-        self.blocks = Blocks(file.path, file.repair)
+        self.blocks = Blocks(self.path, file.repair, alone)
+        if alone:
+            clear_leftovers(self.path)
         last = self.blocks.state
         #: what was saved last, or None
         self.state: Any = None if last is None else unpacked(last)

@@ -10,7 +10,7 @@ import numpy as np
 from bayesmc.engines.approximate.approximation import Approximation
 from bayesmc.engines.approximate.check import Check, checked
 from bayesmc.engines.approximate.stored import as_stored, completed
-from bayesmc.errors import UnknownNodeError
+from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results import DrawsPosterior, Marginal, Posterior
@@ -228,6 +228,18 @@ class ApproximatePosterior(Posterior):
         node = self._node(name)
         labels = node.domain is not None and node.domain.labels is not None
         return (*node.value_shape, node.domain.size) if labels else node.value_shape  # type: ignore[union-attr]
+
+    def bind(self, problem: Problem) -> None:
+        """Not possible: what the approximation works out from functions is not in a file.
+
+        Raises
+        ------
+        UnsupportedError
+        """
+        raise UnsupportedError(
+            f"load(net=): an approximation by {type(self.engine).__name__} goes without its functions; load "
+            "it without net= (it answers from its moments and draws), or call infer again"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions: draws are made before."""

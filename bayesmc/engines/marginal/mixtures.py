@@ -30,7 +30,7 @@ def mixture_quantiles(
     weights, mean, scale = (np.moveaxis(a, 0, -1) for a in (weights, mean, scale))
     mixture = Mixture(weights / weights.sum(axis=-1, keepdims=True), Normal(mean, scale))
     found = np.stack([mixture.ppf(level) for level in levels.reshape(-1)])
-    return found.reshape(*levels.shape, *found.shape[1:])
+    return found.reshape((*levels.shape, *found.shape[1:]))
 
 
 def covariance_within(

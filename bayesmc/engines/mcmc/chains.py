@@ -18,8 +18,9 @@ from bayesmc.engines.base import Engine, kept_names
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
 from bayesmc.engines.mcmc.given import frozen_start, read_start
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
-from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
+from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
+from bayesmc.engines.mcmc.patience import Patience
 from bayesmc.engines.mcmc.question import difference
 from bayesmc.engines.mcmc.saved import SavedChains, answer_so_far
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories

@@ -1,13 +1,14 @@
 """Runs of chains that are saved as they go on, so that another process can go on with them.
 
-What is saved is all that a sweep depends on: the sampler's state, that of the random numbers, and the number of
-sweeps; so a run that was stopped at any draw ends with the same bits. Draws go into blocks, once each.
+What is saved is all that a sweep depends on: the sampler's state, that of the random numbers, and the number
+of sweeps; so a run that was stopped at any draw ends with the same bits. Draws go into blocks, once each.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -107,8 +108,8 @@ class SavedChains:
         loop.diverged = list(np.concatenate(counts)) if counts else []
         return Begun(saved["state"], False, None)
 
-    def held(self, chains: int, first: int) -> Kept | None:
-        """Where draws go, with those that were saved in it; None where none were.
+    def held(self, chains: int, first: int) -> Kept:
+        """Where draws go, with those that were saved in it.
 
         Parameters
         ----------
@@ -118,7 +119,7 @@ class SavedChains:
         saved = self.saver.state
         made = 0 if saved is None or saved["warming"] else saved["draws"]
         self.draws = made
-        total = first if not made else saved["round"]  # type: ignore[index]
+        total = first if not made else saved["round"]
         if self.spilled:
             kept = Kept(self.problem.model, self.names, chains, min(self._buffer(chains), total))
             kept.draws = kept.gone = made
@@ -131,7 +132,9 @@ class SavedChains:
     def stand_ins(self, chains: int, draws: int) -> dict[str, np.ndarray]:
         """Arrays of the draws' shapes that take no room."""
         return {
-            n: np.broadcast_to(np.zeros((), lazy.dtype), lazy.shape) if isinstance(lazy, Lazy) else lazy
+            n: np.broadcast_to(np.zeros((), lazy.dtype), lazy.shape)
+            if isinstance(lazy, Lazy)
+            else lazy
             for n, lazy in self.lazily(chains, draws).items()
         }
 
@@ -142,7 +145,7 @@ class SavedChains:
         for name, part in _apart(rows).items():
             if part.shape[1:2] == (rows["draws"],) and name not in rows["still"]:
                 shape = (chains, draws, *part.shape[2:])
-                found[name] = Lazy(shape, part.dtype, lambda name=name: self._pieces(name))
+                found[name] = Lazy(shape, part.dtype, partial(self._pieces, name))
             else:
                 found[name] = part
         return found
@@ -171,12 +174,17 @@ class SavedChains:
         return window
 
 
-def answer_so_far(engine: Any, problem: Problem, saver: Saver) -> ChainsPosterior | ChainsSums | None:
+def answer_so_far(
+    engine: Any, problem: Problem, saver: Saver
+) -> ChainsPosterior | ChainsSums | None:
     """The posterior of the draws that were saved; None where there are none."""
     saved = saver.state
     if saved is None or saved["warming"]:
         return None
-    known = {**problem.inputs, **{n: o.value for n, o in problem.observed.items() if o.mask is None}}
+    known = {
+        **problem.inputs,
+        **{n: o.value for n, o in problem.observed.items() if o.mask is None},
+    }
     values = {**known, **saved["values"]}
     point = Checkpoint(saved["state"], saved["generator"], values, problem.observed, {})
     found: ChainsPosterior | ChainsSums

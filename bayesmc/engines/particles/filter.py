@@ -14,12 +14,7 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_fa
 from bayesmc.engines.marginal import options as marginal
 from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
-from bayesmc.engines.particles.belief import (
-    ParticleBelief,
-    absorbed,
-    bound,
-    warn_of_a_lonely_step,
-)
+from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound, warn_of_a_lonely_step
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_delay
 from bayesmc.engines.particles.filter_step import FilterStep
@@ -50,16 +45,18 @@ from bayesmc.engines.particles.options import (
     without_functions,
 )
 from bayesmc.engines.particles.record import FilteredParticles
-from bayesmc.engines.particles.run import filtered_by
-from bayesmc.engines.particles.runs import run_of
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
+from bayesmc.engines.particles.run import filtered_by
+from bayesmc.engines.particles.runs import run_of
 from bayesmc.engines.particles.smoothing import Backwards, backwards
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.resampling import Adaptive, checked, scheme_of
+from bayesmc.results import RunFile
 from bayesmc.results.predictive import warn_of_misfit
+from bayesmc.storage import Saver
 
 #: options that hold functions by node
 _FUNCTIONS = ("proposal", "initial_proposal", "rejuvenation")

@@ -13,17 +13,15 @@ from bayesmc.engines.filtering import (
     Queries,
     first_slices,
     observed_answers,
-    pass_slices,
     refuse_forecast,
 )
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
-from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
-from bayesmc.engines.particles.made import Ahead, MadeSlices
-from bayesmc.engines.particles.smc import Layout, Particles, quiet
+from bayesmc.engines.particles.made import MadeSlices
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.particles.written import (

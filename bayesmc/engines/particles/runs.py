@@ -47,11 +47,11 @@ def _saved(
     progress: bool | None,
     file: RunFile,
 ) -> FilteredParticles:
-    """A run that saves itself, or goes on: with as many particles, and the same code, as it was begun with."""
+    """A run that saves itself, or goes on, with as many particles and the same code as it was begun with."""
     if engine.delay is not None:
         raise UnsupportedError(
-            f"ParticleFilter(delay={engine.delay}): a run whose answers come some rows late is not saved; leave "
-            "checkpoint= out, or delay="
+            f"ParticleFilter(delay={engine.delay}): a run whose answers come some rows late is not saved; "
+            "leave checkpoint= out, or delay="
         )
     if file.state is None:
         sized = engine._sized(engine._enough(problem, seed, keep, progress))

@@ -12,7 +12,6 @@ from bayesmc.engines.particles.written import Written, count
 from bayesmc.errors import CheckpointError, UnsupportedError
 from bayesmc.storage import Saver, packed
 
-
 #: what of the choices of a run is made once, and kept in its file
 CHOSEN = ("particles", "compiled")
 

@@ -6,6 +6,7 @@ Every chunk has a random stream of its own, so that all there is to know of a ru
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -116,7 +117,9 @@ class SavedDraws:
         for name in self.names:
             parts = [values[name] for values, _, _ in self._waiting]
             still = parts[0].ndim == len(self.problem.model[name].value_shape)
-            rows["still" if still else "moving"][name] = parts[0] if still else np.concatenate(parts)
+            rows["still" if still else "moving"][name] = (
+                parts[0] if still else np.concatenate(parts)
+            )
         rows["log_weights"] = np.concatenate([logs for _, logs, _ in self._waiting])
         self.saver.save(rows, self._state(None))
         self._waiting, self._size = [], 0
@@ -164,11 +167,11 @@ class SavedDraws:
         found: dict[str, Any] = {n: v[None, None] for n, v in first["still"].items()}
         for name, part in first["moving"].items():
             shape = (1, draws, *part.shape[1:])
-            found[name] = Lazy(shape, part.dtype, lambda name=name: self._pieces("moving", name))
+            found[name] = Lazy(shape, part.dtype, partial(self._pieces, "moving", name))
         if weighted:
             kind = np.dtype(float)
-            found["log_weights"] = Lazy((1, draws), kind, lambda: self._pieces("log_weights"))
-            found["weights"] = Lazy((1, draws), kind, lambda: self._weights(top))
+            found["log_weights"] = Lazy((1, draws), kind, partial(self._pieces, "log_weights"))
+            found["weights"] = Lazy((1, draws), kind, partial(self._weights, top))
         return found
 
     @staticmethod
