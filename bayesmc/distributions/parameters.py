@@ -53,7 +53,7 @@ _KNOWN: dict[type, frozenset[str]] = {}
 def signature(family: type) -> inspect.Signature:
     """The parameters of a family's constructor.
 
-    Those of ``__init__``: before Python 3.11.4 a class whose ``__init__`` is inherited is read by its ``__new__``,
+    Those of ``__init__``: Python 3.11.2 reads a class whose ``__init__`` is inherited by its ``__new__``,
     which takes anything.
     """
     return inspect.Signature(list(inspect.signature(family.__init__).parameters.values())[1:])  # type: ignore[misc]
