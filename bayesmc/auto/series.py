@@ -119,8 +119,8 @@ def filter(
     file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
     if file is None:
         return answer
-    if chosen.saves:
-        return chosen.filter(problem, seed, **options, checkpoint=file)  # type: ignore[call-arg]
+    if isinstance(chosen, ParticleFilter):
+        return chosen.filter(problem, seed, **options, checkpoint=file)
     found = chosen.filter(problem, seed, **options)
     if not getattr(found, "interrupted", False):
         file.finish(found)

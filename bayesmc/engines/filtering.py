@@ -82,8 +82,6 @@ class FilterEngine:
     #: what its ``start`` and ``step`` return
     belief: ClassVar[type] = object
     takes_queries: ClassVar[bool] = True
-    #: whether ``filter`` takes ``checkpoint=`` and saves itself as it goes on; others are saved at the end
-    saves: ClassVar[bool] = False
     #: whether its answers are the model's, up to rounding
     is_exact: ClassVar[bool] = False
 
