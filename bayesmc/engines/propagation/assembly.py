@@ -16,6 +16,7 @@ from bayesmc.engines.propagation.conjugate import ConjugateBatch
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.density import Read
 from bayesmc.engines.propagation.kernels import Switched, Tables
+from bayesmc.engines.propagation.lines import LineBatch
 from bayesmc.engines.propagation.scopes import Rows, basis, padded
 from bayesmc.engines.propagation.statistics import Kept, Linear, OwnFamilies
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
@@ -157,14 +158,15 @@ class Assembly:
         assert domain is not None
         return domain.size
 
-    def _groups(self) -> Iterable[Sequence[int]]:
-        """Coordinates that one factor reads."""
+    def _groups(self) -> Iterable[np.ndarray]:
+        """Coordinates that one factor reads, a row for each."""
         for row in self.rows:
             if len(row.coordinates):
-                yield row.coordinates.tolist()
+                yield row.coordinates[None]
         for read in self.reads:
             if read.coordinates.shape[1]:
-                yield from np.unique(read.coordinates, axis=0).tolist()
+                shared = (read.coordinates == read.coordinates[:1]).all()
+                yield read.coordinates[:1] if shared else read.coordinates
 
     def _clamp(self) -> None:
         """Elements of partly observed finite nodes are what was seen."""
@@ -296,8 +298,9 @@ class Assembly:
         for block in np.unique(sizes):
             mine = np.flatnonzero(sizes == block)
             at = coordinates[mine]
+            kind = LineBatch if weights.shape[1] == 1 and not edges else Batch
             found.append(
-                Batch(
+                kind(
                     name,
                     kernel,
                     len(mine),
@@ -328,7 +331,7 @@ class Assembly:
                 ]
         total = len(variables) + len(scopes)
         edges = [(len(variables) + k, index[v]) for k, s in enumerate(scopes) for v in set(s)]
-        parts = components(total, edges).max(initial=-1) + 1
+        parts = components(total, [np.array(edges)] if edges else []).max(initial=-1) + 1
         return len(edges) > total - parts
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -77,6 +78,7 @@ class Probit:
     offset: np.ndarray
     gain: np.ndarray
     how: str = "probit"
+    is_log_concave: ClassVar[bool] = True
 
     def tilted(
         self,
@@ -85,7 +87,9 @@ class Probit:
         linear: np.ndarray,
         near: tuple[np.ndarray, np.ndarray],
     ) -> Tilt:
-        sign, offset, gain = (a[members] for a in (self.sign, self.offset, self.gain))
+        sign, offset, gain = self.sign, self.offset, self.gain
+        if len(members) < len(sign):
+            sign, offset, gain = (a[members] for a in (sign, offset, gain))
         return probit(sign, offset, gain, precision[:, 0, 0], linear[:, 0])
 
 

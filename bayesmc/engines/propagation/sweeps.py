@@ -19,6 +19,8 @@ from bayesmc.errors import ZeroProbabilityError
 
 #: sweeps after which the change must have shrunk by a factor; else shares do, down to the smallest
 _PATIENCE, _SHRUNK, _SHARE, _LEAST = 8, 0.5, 0.6, 0.02
+#: factor by which undamped sweeps are to shrink the rest for damping to be left out, and to be back
+_QUICK, _SLOW = 0.35, 0.7
 #: probabilities below this do not count as changed
 _TINY = 1e-12
 
@@ -60,6 +62,43 @@ class Settled:
     silent: Mapping[str, int] = field(default_factory=dict)
 
 
+class Pace:
+    """The share of the way that beliefs move in a sweep.
+
+    Where messages come no closer it gets smaller. Where the damping is what slows them, it is left out: if
+    undamped sweeps shrank the rest by a factor r, damped ones with a share d of the old shrink it by d + (1 -
+    d) r. Should whole steps then come no closer, the damping is back for good. ``is_easy`` begins with these.
+    """
+
+    def __init__(self, damping: float, is_easy: bool = False) -> None:
+        self.given = self.share = 1.0 - damping
+        if is_easy:
+            self.share = 1.0
+        self.history: list[float] = []
+        self.may_relax = damping > 0.0
+
+    @property
+    def is_slowest(self) -> bool:
+        return self.share <= _LEAST
+
+    def shorten(self) -> None:
+        self.share, self.history = max(self.share * _SHARE, _LEAST), []
+        self.may_relax = False
+
+    def saw(self, change: float) -> None:
+        """What a sweep changed, with messages not settled."""
+        self.history.append(change)
+        last = self.history[-3:]
+        if len(self.history) > _PATIENCE and change > _SHRUNK * self.history[-1 - _PATIENCE]:
+            self.shorten()
+        elif self.share > self.given and len(last) > 1 and change > _SLOW * last[-2]:
+            self.share, self.may_relax, self.history = self.given, False, []
+        elif self.may_relax and len(last) == 3 and self.share == self.given:
+            bound = 1.0 - self.share * (1.0 - _QUICK)
+            if last[1] < bound * last[0] and last[2] < bound * last[1]:
+                self.share, self.history = 1.0, []
+
+
 def settle(
     system: System,
     *,
@@ -71,40 +110,39 @@ def settle(
     """Pass messages until nothing changes, or ``sweeps`` times."""
     beliefs, batches = system.beliefs, system.batches
     order = [*batches, *reversed(batches[:-1])] if len(batches) > 1 else batches
-    share, skipped, left, change, done = 1.0 - damping, 0, 0, np.inf, 0
-    history: list[float] = []
+    pace, skipped, left, change, done = Pace(damping, _is_easy(batches)), 0, 0, np.inf, 0
     skips: list[tuple[Batch, int]] = []
-    step = share
+    step = pace.share
     if not any(b.count for b in batches):
         _refresh(beliefs)
-        return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, share)
+        return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, pace.share)
     while done < sweeps:
         before = _marginals(beliefs)
         for batch in batches:
             batch.error = 0.0
-        skips = [(batch, batch.visit(beliefs, share).skipped) for batch in order]
+        skips = [(batch, batch.visit(beliefs, pace.share).skipped) for batch in order]
         left = sum(n for _, n in skips)
         change = _distance(before, _marginals(beliefs))
         done, skipped = done + 1, skipped + left
         if advance is not None:
             advance()
         # a share of the way leaves the rest of it: what is ahead is judged, not the step
-        step = cautious(share, max(b.error for b in batches))
-        if change <= tolerance * step:
-            # beliefs that rest while messages are open have not settled: shorter moves may yet be proper
-            if not left or (change == 0.0 and share <= _LEAST):
-                break
-            share, history = max(share * _SHARE, _LEAST), []
-            continue
-        history.append(change)
-        if len(history) > _PATIENCE and change > _SHRUNK * history[-1 - _PATIENCE]:
-            share, history = max(share * _SHARE, _LEAST), []
+        step = cautious(pace.share, max(b.error for b in batches))
+        if change > tolerance * step:
+            pace.saw(change)
+        # beliefs that rest while messages are open have not settled: shorter moves may yet be proper
+        elif not left or (change == 0.0 and pace.is_slowest):
+            break
+        else:
+            pace.shorten()
     _refuse_impossible(system)
     error = max((b.error for b in batches), default=0.0)
     settled = bool(change <= tolerance * step and not left)
     total = np.nan if left and not settled else _evidence(system)
     silent = _silent([b for b, n in skips if n]) if left else {}
-    return Settled(settled, done, float(change), skipped, left, total, error, share, silent=silent)
+    return Settled(
+        settled, done, float(change), skipped, left, total, error, pace.share, silent=silent
+    )
 
 
 def pass_once(system: System) -> Settled:
@@ -135,6 +173,13 @@ def _silent(batches: Sequence[Batch]) -> dict[str, int]:
         if count:
             found[batch.name] = found.get(batch.name, 0) + count
     return found
+
+
+def _is_easy(batches: Sequence[Batch]) -> bool:
+    """Whether all that is approximated is one batch of log-concave factors, whose messages are never improper
+    (Seeger 2008, JMLR 9, sec. 4)."""
+    inexact = [b for b in batches if not b.is_exact]
+    return len(inexact) == 1 and getattr(inexact[0].kernel, "is_log_concave", False)
 
 
 def _refresh(beliefs: Beliefs) -> None:
@@ -168,7 +213,8 @@ def _distance(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray
         else:
             p, q = (np.maximum(a[0], _TINY) for a in (one, two))
             apart = ((p - q) * np.log(p / q)).sum(axis=-1)
-        worst = max(worst, float(np.nan_to_num(apart, nan=np.inf).max()))
+        most = float(apart.max())  # NaN where any is
+        worst = max(worst, np.inf if np.isnan(most) else most)
     return float(np.sqrt(max(worst, 0.0)))
 
 
