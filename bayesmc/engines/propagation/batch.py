@@ -138,7 +138,7 @@ class Batch:
         fine = np.isfinite(found.log) & (found.log > self.floor)
         self.error = max(self.error, found.error)
         skipped = int((~fine).sum())
-        if members is None:
+        if len(at) > 1:
             share = cautious(share, found.error)
         self._send_tables(beliefs, at, found, fine, share if self.k else _whole(share))
         if self.k:

@@ -47,9 +47,7 @@ class Reader(Protocol):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]: ...
 
 
-def probit_of(
-    terms: Reader, name: str, shape: tuple[int, ...], at: np.ndarray
-) -> Directed | None:
+def probit_of(terms: Reader, name: str, shape: tuple[int, ...], at: np.ndarray) -> Directed | None:
     """Some elements of an observed node, where it has such a probability; else None."""
     if name not in terms.model.nodes or name not in terms.known:
         return None
@@ -77,7 +75,7 @@ def _inside_cdf(terms: Reader, name: str, shape: tuple[int, ...]) -> _Inside | N
     kept = terms.model.cache.setdefault("affine inside of probits", {})
     key = name, terms.cut, frozenset(terms.numbers)
     if is_plain and key in kept:
-        return kept[key]  # type: ignore[no-any-return]
+        return kept[key]
     family, found = terms.result(name), None
     if isinstance(family, Family) and family.make is Bernoulli:
         probs = family.parameters.get("probs")
@@ -99,7 +97,7 @@ def _directions(
     numbers = terms.numbers.items()
     token = at.tobytes(), *((n, x.at.tobytes(), x.seen.tobytes()) for n, x in numbers)
     if token in inside.kept:
-        return inside.kept[token]  # type: ignore[no-any-return]
+        return inside.kept[token]
     offset, gain, coordinates = terms.coefficients((inside.form,), terms.known, (), shape, at)
     weights, within = basis(gain.reshape(len(at), 1, -1))
     found = offset[:, 0, 0], within[:, 0, 0], coordinates, weights

@@ -14,13 +14,11 @@ import numpy as np
 
 from bayesmc.engines.propagation.batch import Batch, cautious
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs
+from bayesmc.engines.propagation.lines import LineBatch
+from bayesmc.engines.propagation.pace import Pace
 from bayesmc.engines.propagation.system import System
 from bayesmc.errors import ZeroProbabilityError
 
-#: sweeps after which the change must have shrunk by a factor; else shares do, down to the smallest
-_PATIENCE, _SHRUNK, _SHARE, _LEAST = 8, 0.5, 0.6, 0.02
-#: factor by which undamped sweeps are to shrink the rest for damping to be left out, and to be back
-_QUICK, _SLOW = 0.35, 0.7
 #: probabilities below this do not count as changed
 _TINY = 1e-12
 
@@ -62,43 +60,6 @@ class Settled:
     silent: Mapping[str, int] = field(default_factory=dict)
 
 
-class Pace:
-    """The share of the way that beliefs move in a sweep.
-
-    Where messages come no closer it gets smaller. Where the damping is what slows them, it is left out: if
-    undamped sweeps shrank the rest by a factor r, damped ones with a share d of the old shrink it by d + (1 -
-    d) r. Should whole steps then come no closer, the damping is back for good. ``is_easy`` begins with these.
-    """
-
-    def __init__(self, damping: float, is_easy: bool = False) -> None:
-        self.given = self.share = 1.0 - damping
-        if is_easy:
-            self.share = 1.0
-        self.history: list[float] = []
-        self.may_relax = damping > 0.0
-
-    @property
-    def is_slowest(self) -> bool:
-        return self.share <= _LEAST
-
-    def shorten(self) -> None:
-        self.share, self.history = max(self.share * _SHARE, _LEAST), []
-        self.may_relax = False
-
-    def saw(self, change: float) -> None:
-        """What a sweep changed, with messages not settled."""
-        self.history.append(change)
-        last = self.history[-3:]
-        if len(self.history) > _PATIENCE and change > _SHRUNK * self.history[-1 - _PATIENCE]:
-            self.shorten()
-        elif self.share > self.given and len(last) > 1 and change > _SLOW * last[-2]:
-            self.share, self.may_relax, self.history = self.given, False, []
-        elif self.may_relax and len(last) == 3 and self.share == self.given:
-            bound = 1.0 - self.share * (1.0 - _QUICK)
-            if last[1] < bound * last[0] and last[2] < bound * last[1]:
-                self.share, self.history = 1.0, []
-
-
 def settle(
     system: System,
     *,
@@ -120,16 +81,17 @@ def settle(
         before = _marginals(beliefs)
         for batch in batches:
             batch.error = 0.0
-        skips = [(batch, batch.visit(beliefs, pace.share).skipped) for batch in order]
+        skips = [(batch, _visited(batch, beliefs, pace)) for batch in order]
         left = sum(n for _, n in skips)
-        change = _distance(before, _marginals(beliefs))
+        after = _marginals(beliefs)
+        change = _distance(before, after)
         done, skipped = done + 1, skipped + left
         if advance is not None:
             advance()
         # a share of the way leaves the rest of it: what is ahead is judged, not the step
         step = cautious(pace.share, max(b.error for b in batches))
         if change > tolerance * step:
-            pace.saw(change)
+            pace.saw(change, _moved(before, after))
         # beliefs that rest while messages are open have not settled: shorter moves may yet be proper
         elif not left or (change == 0.0 and pace.is_slowest):
             break
@@ -175,6 +137,15 @@ def _silent(batches: Sequence[Batch]) -> dict[str, int]:
     return found
 
 
+def _visited(batch: Batch, beliefs: Beliefs, pace: Pace) -> int:
+    """Visit all factors, rows of one number in as many parts as the pace says; how many were skipped."""
+    parts = min(pace.parts, batch.count) if isinstance(batch, LineBatch) else 1
+    if parts == 1:
+        return batch.visit(beliefs, pace.share).skipped
+    groups = (batch.everyone[k::parts] for k in range(parts))
+    return sum(batch.visit(beliefs, pace.share, group).skipped for group in groups)
+
+
 def _is_easy(batches: Sequence[Batch]) -> bool:
     """Whether all that is approximated is one batch of log-concave factors, whose messages are never improper
     (Seeger 2008, JMLR 9, sec. 4)."""
@@ -216,6 +187,15 @@ def _distance(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray
         most = float(apart.max())  # NaN where any is
         worst = max(worst, np.inf if np.isnan(most) else most)
     return float(np.sqrt(max(worst, 0.0)))
+
+
+def _moved(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """Where a sweep went: of numbers in standard deviations, of the rest in what describes it."""
+    found = []
+    for one, two in zip(before, after, strict=True):
+        step = two[0] - one[0]
+        found.append((step / np.sqrt(two[1]) if len(one) == 2 else step).ravel())
+    return np.concatenate(found)
 
 
 def _evidence(system: System) -> float:
