@@ -169,14 +169,10 @@ class Terms:
         node, family = model[name], self.result(name)
         if isinstance(family, Distribution):
             family = family_of(family)
-        parameters = {
-            k: cast(v, float) if isinstance(v, Expression) and v.dtype.kind == "b" else v
-            for k, v in family.parameters.items()
-        }
         value: Expression = stored_leaf(model, node)
         if node.domain is not None and node.domain.low:
             value = elementwise(np.add, value, node.domain.low)
-        root = broadcast(log_density(Family(family.make, parameters), value), shape)
+        root = broadcast(log_density(family, value), shape)
         root = self.substituted(root)
         own = self.numbers.get(name)
         if own is not None and not own.is_plain:

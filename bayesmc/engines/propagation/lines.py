@@ -55,11 +55,16 @@ class LineBatch(Batch):
 
     # ---- private -------------------------------------------------------------------------------
 
+    def _is_whole(self, blocks: Blocks) -> bool:
+        """Whether every factor reads all of one component, in order."""
+        return self.turned is not None and len(self.turned) == blocks.linear.shape[1]
+
     def _along(self, blocks: Blocks) -> tuple[np.ndarray, np.ndarray]:
         """Means and variances of all directions."""
-        if self.turned is None:
+        if not self._is_whole(blocks):
             mean, var = self._projected(blocks, self.everyone)
             return mean[:, 0], var[:, 0, 0]
+        assert self.turned is not None
         c = self.component[0]
         mean = blocks.mean[c] @ self.turned
         return mean, np.einsum("mf,mf->f", blocks.cov[c] @ self.turned, self.turned)
@@ -84,9 +89,10 @@ class LineBatch(Batch):
         return False
 
     def _put(self, blocks: Blocks, change: np.ndarray, move: np.ndarray) -> None:
-        if self.turned is None:
+        if not self._is_whole(blocks):
             self._add(blocks, self.everyone, change[:, None, None], move[:, None])
             return
+        assert self.turned is not None
         c = self.component[0]
         added = (self.turned * change) @ self.turned.T
         blocks.precision[c] += 0.5 * (added + added.T)

@@ -16,7 +16,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
 from bayesmc.engines.variational.excluded import left_out
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
-from bayesmc.engines.variational.jumping import refuse_jumps
+from bayesmc.engines.variational.jumping import refuse_edges, refuse_jumps
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
 from bayesmc.engines.variational.places import other_places, told
 from bayesmc.engines.variational.plan import plan_for
@@ -302,6 +302,7 @@ class MeanField(Engine):
         posterior.elbo, posterior.elbo_mcse = float(posterior.elbos[-1]), 0.0
         if plan.free is not None:
             refuse_jumps(plan, best.state)
+            refuse_edges(plan, best.state)
             posterior.elbo, posterior.elbo_mcse = measured(plan, best, rng, constant)
         posterior.log_marginal_likelihood = posterior.elbo
         posterior.sweeps, posterior.converged = len(best.bounds), best.converged
