@@ -7,7 +7,7 @@ is found here, too: nodes on which nothing observed depends are drawn forward af
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -319,12 +319,15 @@ class Target:
         return tuple(self.terms[t] for t in sorted(entered, key=self._place.__getitem__))
 
     def log_density(
-        self, values: Mapping[str, np.ndarray], terms: Iterable[Term] | None = None
+        self,
+        values: Mapping[str, np.ndarray],
+        terms: Iterable[Term] | None = None,
+        log_of: Callable[[Term, Mapping[str, np.ndarray]], np.ndarray] = Term.log,
     ) -> Any:
         """Sum of terms (all of them by default), shape the batch."""
         total: Any = 0.0
         for term in self.terms.values() if terms is None else terms:
-            log = term.log(values)
+            log = log_of(term, values)
             if term.shape:
                 lead = log.shape[: log.ndim - len(term.shape)]
                 log = np.broadcast_to(log, lead + term.shape)

@@ -14,6 +14,13 @@ import numpy as np
 
 from bayesmc.engines.propagation.batch import Batch, cautious
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs
+from bayesmc.engines.propagation.contradiction import (
+    Bounds,
+    are_squeezed,
+    bounds_of,
+    contradictory,
+    spreads,
+)
 from bayesmc.engines.propagation.lines import LineBatch
 from bayesmc.engines.propagation.pace import Pace
 from bayesmc.engines.propagation.system import System
@@ -77,6 +84,8 @@ def settle(
     if not any(b.count for b in batches):
         _refresh(beliefs)
         return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, pace.share)
+    bounds = [b for b in map(bounds_of, batches) if b is not None]
+    room = spreads(bounds, beliefs)
     while done < sweeps:
         before = _marginals(beliefs)
         for batch in batches:
@@ -101,6 +110,8 @@ def settle(
     error = max((b.error for b in batches), default=0.0)
     settled = bool(change <= tolerance * step and not left)
     total = np.nan if left and not settled else _evidence(system)
+    if not settled or np.isnan(total) or are_squeezed(room, spreads(bounds, beliefs)):
+        _refuse_contradictory(bounds)
     silent = _silent([b for b, n in skips if n]) if left else {}
     return Settled(
         settled, done, float(change), skipped, left, total, error, pace.share, silent=silent
@@ -114,6 +125,7 @@ def pass_once(system: System) -> Settled:
         for k in range(batch.count):
             skipped += batch.visit(beliefs, 1.0, np.array([k])).skipped
     _refuse_impossible(system, at_all=True)
+    _refuse_contradictory([b for b in map(bounds_of, system.batches) if b is not None])
     met = system.log_scale + beliefs.log_total + sum(float(b.logs.sum()) for b in system.batches)
     total = np.nan if skipped else _evidence(system)
     error = max((b.error for b in system.batches), default=0.0)
@@ -202,6 +214,16 @@ def _evidence(system: System) -> float:
     beliefs = system.beliefs
     parts = [float(b.constants(beliefs).sum()) for b in system.batches if b.count]
     return system.log_scale + beliefs.log_total + sum(parts)
+
+
+def _refuse_contradictory(bounds: Sequence[Bounds]) -> None:
+    names = contradictory(bounds)
+    if names:
+        raise ZeroProbabilityError(
+            "ExpectationPropagation: the evidence has probability zero: what is said by "
+            f"{', '.join(map(repr, names[:6]))} contradicts itself, since no numbers satisfy all of these "
+            "comparisons"
+        )
 
 
 def _refuse_impossible(system: System, at_all: bool = False) -> None:

@@ -29,6 +29,7 @@ from bayesmc.engines.variational.factors import (
     TableFactor,
 )
 from bayesmc.engines.variational.free import FreeFactor
+from bayesmc.errors import UnsupportedError
 from bayesmc.structure.target import Target, Values
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -270,8 +271,12 @@ class FreePart:
     closed: dict[str, Any] = field(default_factory=dict)
 
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
+        if self.factor is None:
+            raise UnsupportedError(
+                "this approximation was unpickled, and pickles carry no functions; call infer again, or draw "
+                "before pickling"
+            )
         z = rng.standard_normal((draws, len(self.mean)))
-        assert self.factor is not None
         full = self.root.ndim == 2
         u = self.mean + (z @ self.root.T if full else z * self.root)
         diagonal = np.diagonal(self.root) if full else self.root
