@@ -6,8 +6,8 @@ side from which they do not overshoot.
 
 References
 ----------
-Abramowitz and Stegun (1964), 6.5.29 (series), 6.5.31 (continued fraction), 26.5.4 (beta); Press et al. (2007),
-Numerical Recipes, 3rd ed., sec. 6.2 (Lentz's method).
+Abramowitz and Stegun (1964), 6.5.29 (series), 6.5.31 (continued fraction), 26.5.4 (beta); Press et al.
+(2007), Numerical Recipes, 3rd ed., sec. 6.2 (Lentz's method).
 """
 
 from __future__ import annotations

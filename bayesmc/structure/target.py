@@ -373,7 +373,9 @@ def _target(problem: Problem, also: frozenset[str]) -> Target:
         elif seen is not None and seen.mask is None:
             known[name] = seen.value
         elif 0 in node.plate_shape:  # no element of it is hidden
-            known[name] = np.zeros(node.value_shape, float if node.domain is None else node.domain.dtype)
+            known[name] = np.zeros(
+                node.value_shape, float if node.domain is None else node.domain.dtype
+            )
         else:
             varying.add(name)
     also &= varying

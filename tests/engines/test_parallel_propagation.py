@@ -1,4 +1,4 @@
-"""Rows of a regression visited all at once: the fixed points of row by row, and what happens where they swing."""
+"""Rows of a regression visited all at once: the fixed points of row by row, and what where they swing."""
 
 from __future__ import annotations
 

@@ -10,8 +10,8 @@ References
 ----------
 Vehtari, Simpson, Gelman, Yao and Gabry (2024), Pareto smoothed importance sampling, JMLR 25, algorithm 1 and
 sec. 3.3; Chatterjee and Diaconis (2018), The sample size required in importance sampling, Annals of Applied
-Probability 28, sec. 1; Yao, Vehtari, Simpson and Gelman (2018), Yes, but did it work?: Evaluating variational inference,
-ICML, sec. 3.1.
+Probability 28, sec. 1; Yao, Vehtari, Simpson and Gelman (2018), Yes, but did it work?: Evaluating variational
+inference, ICML, sec. 3.1.
 """
 
 from __future__ import annotations
@@ -243,8 +243,8 @@ def pareto_smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     Weights that are equal to rounding are left as they are, with k minus infinity. The fit takes weights that
     come in lumps (of finite states), or one that stands out among next to equal ones, for a heavy tail. Of
     weights with that tail the largest of S carries about S^(k - 1) of their sum (Chatterjee and Diaconis 2018
-    judge by that share); where it carries less than 1/sqrt(S), as it does of those with a variance, weights are
-    left as they are, and k is the shape of so small a largest one.
+    judge by that share); where it carries less than 1/sqrt(S), as it does of those with a variance, weights
+    are left as they are, and k is the shape of so small a largest one.
     """
     from arviz_stats.base import array_stats
 

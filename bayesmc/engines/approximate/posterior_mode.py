@@ -215,7 +215,7 @@ def _values(target: Target, density: UnconstrainedDensity, mode: Mode) -> dict[s
 
 
 def _at_edge(density: UnconstrainedDensity, mode: Mode) -> tuple[str, ...]:
-    """Numbers at the edge of their support; of shares those that are nothing, whichever free number led there."""
+    """Numbers at the edge of their support; of shares those that are 0, whichever free number led there."""
     found: list[str] = []
     values = density.constrain(mode.u)
     for node in density.nodes:

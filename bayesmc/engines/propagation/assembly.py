@@ -26,6 +26,7 @@ from bayesmc.structure.target import Target
 
 #: coordinates of one component, whose covariance is kept whole
 _WIDEST = 4000
+_EPSILON = float(np.finfo(float).eps)
 #: name, scope and logs of a factor of finite variables
 Table = tuple[str, tuple[Variable, ...], np.ndarray]
 
@@ -351,11 +352,28 @@ def _begin(problem: Problem, system: System) -> None:
             cov = wide @ np.matrix_transpose(batch.weights)
             batch.begin(beliefs, middle, cov)
     for block in beliefs.blocks:
-        if len(block.linear) and block.refreshed().any():
+        if not len(block.linear):
+            continue
+        improper = block.refreshed()
+        if improper.any():
+            _refuse_improper(block.precision[improper][0])
+
+
+def _refuse_improper(precision: np.ndarray) -> None:
+    """Say why numbers have no joint Gaussian: no prior, or one beside which noise is too small to tell."""
+    own = precision.diagonal()
+    if np.isfinite(precision).all() and (own > 0).all():
+        smallest = np.linalg.eigvalsh(precision)[0]
+        if abs(smallest) <= 10.0 * len(own) * _EPSILON * own.max():
             raise UnsupportedError(
-                "ExpectationPropagation: some numbers have no proper prior; give every node a density that "
-                "has an integral"
+                "ExpectationPropagation: rounding hides what is known of some numbers beside noise as small "
+                f"as a standard deviation of {own.max() ** -0.5:.2g}, or they have no proper prior; give "
+                "more noise or a narrower prior, or use Exact() where all is linear-Gaussian"
             )
+    raise UnsupportedError(
+        "ExpectationPropagation: some numbers have no proper prior; give every node a density that "
+        "has an integral"
+    )
 
 
 def _global(beliefs: Beliefs, batch: Batch) -> np.ndarray:

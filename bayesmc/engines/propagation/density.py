@@ -22,10 +22,8 @@ from bayesmc.errors import BudgetError, TraceError, UnsupportedError
 from bayesmc.expression import (
     Elementwise,
     Expression,
-    Family,
     Program,
     broadcast,
-    cast,
     elementwise,
 )
 from bayesmc.expression.graph import substituted as _with

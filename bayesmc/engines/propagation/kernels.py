@@ -183,10 +183,15 @@ class Density:
         points = np.concatenate(
             [filled[:, :1] - wide, 0.5 * (filled[:, 1:] + filled[:, :-1]), ends + wide], axis=-1
         )
-        u = self.offset[members][None] + self.gain[members][None, ..., 0] * points.T[..., None, None]
+        u = (
+            self.offset[members][None]
+            + self.gain[members][None, ..., 0] * points.T[..., None, None]
+        )
         alive = self.log_factor(members, u)[..., 0].T > -np.inf
         alive[:, 1:-1] &= np.diff(filled, axis=-1) > 0
-        sides = np.concatenate([np.full_like(ends, -np.inf), filled, np.full_like(ends, np.inf)], -1)
+        sides = np.concatenate(
+            [np.full_like(ends, -np.inf), filled, np.full_like(ends, np.inf)], -1
+        )
         rows = np.arange(len(members))
         known = (last[:, 0] > 0) & alive.any(axis=-1)
         low = np.where(known, sides[rows, alive.argmax(axis=-1)], -np.inf)

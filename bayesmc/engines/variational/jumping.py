@@ -54,8 +54,8 @@ def refuse_jumps(plan: Plan, state: State) -> None:
 def refuse_edges(plan: Plan, state: State) -> None:
     """Refuse a density that is zero beyond some values of a free number, where draws of the prior lie.
 
-    A normal factor has mass beyond any edge, where the bound is minus infinity: what it climbs is a sum over a
-    few points, and it shrinks until these are inside.
+    A normal factor has mass beyond any edge, where the bound is minus infinity: what it climbs is a sum over
+    a few points, and it shrinks until these are inside.
 
     Raises
     ------
@@ -79,8 +79,8 @@ def refuse_edges(plan: Plan, state: State) -> None:
         if jumps_between(root, FREE, own, low, high, to_zero=True).any():
             raise UnsupportedError(
                 f"MeanField: the density is zero beyond some values of node {node.name!r} (an observed "
-                "comparison, or bounds that depend on other nodes), in front of which a normal factor would be "
-                "squeezed; use ExpectationPropagation(), Gibbs() or HamiltonianMonteCarlo()"
+                "comparison, or bounds that depend on other nodes), in front of which a normal factor would "
+                "be squeezed; use ExpectationPropagation(), Gibbs() or HamiltonianMonteCarlo()"
             )
 
 
