@@ -1,8 +1,8 @@
 """Log probabilities of rare outcomes, where a model's own functions round their complement to 1.
 
 ``Bernoulli(ndtr(x))`` leaves ``log(1 - ndtr(x))`` for an outcome of 0, which is minus infinity from x = 8.3
-on and rough before. The expression of the same node knows that it is ``log_ndtr(-x)``. It is believed where both
-say the same probability to rounding, so that a fault of reading still shows.
+on and rough before. The expression of the same node knows that it is ``log_ndtr(-x)``. It is believed where
+both say the same probability to rounding, so that a fault of reading still shows.
 """
 
 from __future__ import annotations
