@@ -157,9 +157,11 @@ class Check:
             node = self.posterior.model[name]
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
                 continue
-            # of what draws answer the same draws without weights: what moves is no chance
-            closed = self.approximation.marginal(name) is not None
-            before_weights = self.approximate if closed else self._unweighted
+            # of what draws answer, the same draws without weights, unless these have heavier tails
+            own = self.approximation
+            closed = own.marginal(name) is not None or own.probabilities(name) is not None
+            is_plain = closed or getattr(own, "spread", None) is not None
+            before_weights = self.approximate if is_plain else self._unweighted
             plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
             before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
             error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
