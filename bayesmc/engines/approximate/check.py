@@ -202,7 +202,8 @@ def checked(
         )
     own = _weighed(posterior, approximation, approximation.draw(rng, int(draws)), rng)
     spread, found = getattr(approximation, "spread", None), own
-    if spread is not None and own.k > -np.inf:
+    # equal weights say that it is exact, unless it has left states out that no draw meets
+    if spread is not None and (own.k > -np.inf or getattr(approximation, "tied", ())):
         found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
     k = max(
         own.k, found.k

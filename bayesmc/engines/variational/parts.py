@@ -225,6 +225,7 @@ class TablePart:
     table: np.ndarray
     sizes: tuple[int, ...]
     dtypes: tuple[np.dtype, ...]
+    seen: np.ndarray | None = None
 
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
         levels = np.cumsum(self.table, axis=0)
@@ -340,7 +341,7 @@ def part_of(factor: Factor, state: State, target: Target) -> Part:
     if isinstance(factor, TableFactor):
         domains = [target.model[name].domain for name in factor.names]
         dtypes = tuple(d.dtype for d in domains if d is not None)
-        return TablePart(factor.names, state[factor.table], factor.sizes, dtypes)
+        return TablePart(factor.names, state[factor.table], factor.sizes, dtypes, factor.seen)
     assert isinstance(factor, (ShareFactor, ScatterFactor))
     seen, known = target.seen(factor.own.name), Known()
     if seen is not None and factor.seen is not None:
