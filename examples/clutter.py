@@ -77,8 +77,7 @@ def engines(fast: bool) -> dict[str, list[Any]]:
         "EP": [bmc.ExpectationPropagation(sweeps=k, damping=0.0) for k in (1, 2, 3, 5, 20)],
         "ADF": [bmc.AssumedDensity()],
         "Laplace": [bmc.LaplaceApproximation(starts=k) for k in (1, 8)],
-        "VB": [bmc.MeanField(restarts=1, sweeps=k) for k in (1, 2, 3, 5, 20)]
-        + [bmc.MeanField()],
+        "VB": [bmc.MeanField(restarts=1, sweeps=k) for k in (1, 2, 3, 5, 20)] + [bmc.MeanField()],
         "importance": [bmc.LikelihoodWeighting(10**k) for k in range(2, 2 + few)],
         "Gibbs": [bmc.Gibbs(draws=4**k * 5, warmup=20, chains=4) for k in range(1, 1 + few)],
     }

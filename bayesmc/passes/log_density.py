@@ -22,16 +22,9 @@ from scipy import special
 
 from bayesmc import distributions as d
 from bayesmc.errors import TraceError
-from bayesmc.expression import (
-    Constant,
-    Expression,
-    Family,
-    TracedArray,
-    as_expression,
-    cast,
-    trace,
-)
+from bayesmc.expression import Constant, Expression, Family, TracedArray, as_expression, trace
 from bayesmc.expression.composed import log_sum_exp
+from bayesmc.expression.graph import cast
 from bayesmc.passes.interval_mass import log_mass
 
 _LOG_2PI = math.log(2 * math.pi)

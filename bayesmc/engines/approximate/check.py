@@ -203,7 +203,7 @@ def checked(
     own = _weighed(posterior, approximation, approximation.draw(rng, int(draws)), rng)
     spread, found = getattr(approximation, "spread", None), own
     # equal weights say that it is exact, unless it has left states out that no draw meets
-    if spread is not None and (own.k > -np.inf or getattr(approximation, "tied", ())):
+    if spread is not None and (own.k > -np.inf or hasattr(approximation, "tied")):
         found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
     k = max(
         own.k, found.k
