@@ -305,20 +305,12 @@ class MeanField(Engine):
         if plan.free is not None:
             where = f"unconstrained numbers of {', '.join(plan.free.names)}"
         tied = left_out(plan, best.state)
-        posterior = MeanFieldPosterior(
-            problem,
-            self,
-            MeanFieldApproximation(parts, where, tuple(tied)),
-            seed,
-            None,
-            self.draws,
-        )
+        found_by = MeanFieldApproximation(parts, where, tuple(tied))
+        posterior = MeanFieldPosterior(problem, self, found_by, seed, None, self.draws)
         posterior.elbos = np.array(best.bounds) + constant
         posterior.bounds = np.array([a.bounds[-1] for a in found]) + constant
         posterior.elbo, posterior.elbo_mcse = float(posterior.elbos[-1]), 0.0
         if plan.free is not None:
-            refuse_jumps(plan, best.state)
-            refuse_edges(plan, best.state)
             posterior.elbo, posterior.elbo_mcse = measured(plan, best, rng, constant)
         posterior.log_marginal_likelihood = posterior.elbo
         posterior.sweeps, posterior.converged = len(best.bounds), best.converged
@@ -367,6 +359,8 @@ def measured(
     scrambled sequences.
     """
     assert plan.free is not None
+    refuse_jumps(plan, best.state)
+    refuse_edges(plan, best.state)
     free = plan.free
     entropy = sum(f.entropy(best.state) for f in plan.factors) + constant
 
