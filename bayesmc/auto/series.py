@@ -18,7 +18,7 @@ from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.marginal.options import is_worth_it, without_tables
+from bayesmc.engines.marginal.options import is_worth_it, asking
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
@@ -250,14 +250,14 @@ def explained_series(
     asked = Asked(question, keep, read_queries("explain", queries))
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
-        nodes = without_tables(chosen, question).describe(problem)
+        nodes = asking(chosen, question).describe(problem)
         return Explanation(
             chosen, reasons, refused, nodes, effort=chosen.effort_for(problem, asked)
         )
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
     if why is None:
-        teller = without_tables(checked, question)
+        teller = asking(checked, question)
         nodes, effort = teller.describe(problem), teller.effort_for(problem, asked)
         return Explanation(checked, ("it was asked for",), {}, nodes, effort=effort)
     reasons = ("it was asked for, but it cannot answer",)
@@ -324,7 +324,7 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
                 late.append(engine)
         if reason is None:
             instead = _instead(engine, displaced, asked, refused)
-            why = without_tables(engine, asked.what).reasons(problem) or (_WHY[name],)
+            why = asking(engine, asked.what).reasons(problem) or (_WHY[name],)
             return _Chosen(engine, why if instead is None else (*why, instead), refused, instead)
         refused[name] = reason
     if late:  # nothing that is better can answer
@@ -343,7 +343,7 @@ def _made(candidate: type[FilterEngine], problem: SeriesProblem, asked: Asked) -
     if candidate is ParticleFilter and common_refusal(ParticleFilter(), problem) is None:
         engine = ParticleFilter(marginalize="auto")
         if (
-            is_worth_it(without_tables(engine, asked.what), problem)
+            is_worth_it(asking(engine, asked.what), problem)
             and _why_not(engine, problem, asked) is None
         ):
             return engine

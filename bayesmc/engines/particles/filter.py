@@ -200,6 +200,8 @@ class ParticleFilter(FilterEngine):
     tolerance: float = TOLERANCE
     compiled: bool | None = None
     budget: int = BUDGET
+    #: what is asked, where that is about the past
+    question: str = field(default="filter", init=False, repr=False, compare=False)
 
     label: ClassVar[str] = "particle filter"
     keeps: ClassVar[bool] = True
@@ -317,7 +319,7 @@ class ParticleFilter(FilterEngine):
         check_choice("backward", backward, "rejection", "exact", "smooth")
         if why := self.unable(problem, Asked("smooth" if lag is None else "fixed-lag")):
             raise UnsupportedError(why)
-        own: ParticleFilter = marginal.without_tables(self, "smooth")
+        own: ParticleFilter = marginal.asking(self, "smooth" if lag is None else "fixed-lag")
         if not own._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = own._sized(own._enough(problem, seed, lag is None, progress))
