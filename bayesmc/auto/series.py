@@ -18,7 +18,7 @@ from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.marginal.options import is_worth_it, asking
+from bayesmc.engines.marginal.options import asking, is_worth_it
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter

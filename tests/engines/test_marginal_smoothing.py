@@ -399,10 +399,11 @@ FAULTS = {
         "switching", Edit(SMOOTHING + "_Paths.log_after", "found.reshape(which.shape) + log", "log")
     ),
     "sampled nodes that follow do not choose": (
-        "switching", Edit(SMOOTHING + "_Paths.log_after", "found.reshape(which.shape) + log", "found.reshape(which.shape)")
+        "switching", Edit(SMOOTHING + "_Paths.log_after", "(which.shape) + log", "(which.shape)")
     ),
     "beliefs are those of the filter": (
-        "switching", Edit(SMOOTHING + "_Paths.believed", "combined(messages[k].numbers, filtered)", "filtered")
+        "switching",
+        Edit(SMOOTHING + "_Paths.believed", "combined(messages[k].numbers, filtered)", "filtered"),
     ),
     "constants that depend on the particle are lost": (
         "by the last regime", Edit(SMOOTHING + "_Paths.log_after", "own + log_evidence(", "log_evidence(")

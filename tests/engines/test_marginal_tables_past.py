@@ -1,4 +1,4 @@
-"""Tables carried by particles, asked about slices before: ``smooth``, ``lag=``, ``delay=``, against exact answers.
+"""Tables that particles carry, asked about slices before: ``smooth``, ``lag=``, ``delay=``; exact answers.
 
 Comparisons have a false-alarm rate of 1e-3 each (``repeated_test``), at fixed seeds; planted faults are seen.
 """
@@ -162,7 +162,7 @@ FAULTS = {
         "colours", "lag", Edit(PAST + "beliefs:Tables.looking_back", "a @ b for a, b", "a for a, b"),
     ),
     "a late answer is that of the filter": (
-        "colours", "lag", Edit(PAST + "beliefs:_given_next", "log[..., :, None] + pair", "0.0 * log[..., :, None] + pair"),
+        "colours", "lag", Edit(PAST + "beliefs:_given_next", "log[..., :, None] + pair", "pair"),
     ),
 }  # fmt: skip
 

@@ -450,6 +450,19 @@ def test_what_it_cannot_do_is_refused_by_name() -> None:
     assert why is not None and why.startswith("ExpectationPropagation: ")
 
 
+def test_families_are_of_nets_and_refused_over_time() -> None:
+    engine = ExpectationPropagation(families={"x": "normal"})
+    with pytest.raises(UnsupportedError, match=r"families=.*over time"):
+        bmc.smooth(jumping(), {"y": [0.1]}, engine=engine)
+
+
+def test_errors_that_are_not_of_chance_are_not_told_to_be_none() -> None:
+    rows = {"y": [0.1, 0.4]}
+    for engine in (EP, SwitchingKalmanFilter()):
+        assert bmc.smooth(jumping(), rows, engine=engine).mcse("x") is None
+        assert bmc.filter(jumping(), rows, engine=engine).mcse("s") is None
+
+
 def test_numbers_that_later_rows_tell_exactly_are_refused() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -161,6 +162,20 @@ def is_worth_it(engine: Any, problem: SeriesProblem) -> bool:
     return bool(split.inner) or (split.tables is not None and split.tables.joint > FEW)
 
 
+def numbers_carried(engine: Any, problem: SeriesProblem) -> float:
+    """Of a particle: entries of its tables, and of the roots of its covariances."""
+    split = None if engine.marginalize is None else split_of_problem(engine, problem)
+    if split is None:
+        return 0.0
+    slices = problem.slices
+    sizes = [np.prod(slices.later[n].value_shape) for n in split.inner]
+    apart = math.prod(slices.first.sizes[p] for p in blocks_of(slices, split))
+    found = float(sum(sizes)) ** 2 / max(apart, 1)
+    if split.tables is not None:
+        found += sum(g.elements * g.states for g in split.tables.groups)
+    return found
+
+
 def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Why this engine is taken, where something is integrated out."""
     split = split_of_problem(engine, problem)
@@ -263,6 +278,6 @@ def _why_untabled(slices: Slices, split: Split, what: str) -> str | None:
         return None
     name = next(n for n in slices.dynamic if n in late)
     return (
-        f"{name!r} is computed from them, or missing, and what a particle has of it was drawn before the later "
+        f"{name!r} is computed from them, or missing, and what a particle has of it was drawn before later "
         "rows came"
     )

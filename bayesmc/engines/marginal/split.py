@@ -161,8 +161,8 @@ def _found(
     others = tuple(n for n in asked if n not in finite)
     if finite and untabled is not None:
         raise UnsupportedError(
-            f"marginalize= names {finite[0]!r}, of which tables tell nothing of slices before here: {untabled}; "
-            f"leave {', '.join(map(repr, finite))} out"
+            f"marginalize= names {finite[0]!r}, of which tables tell nothing of slices before here: "
+            f"{untabled}; leave {', '.join(map(repr, finite))} out"
         )
     numbers = search.named(others, finite)
     apart_from = {*numbers.inner, *numbers.below}

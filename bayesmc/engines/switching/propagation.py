@@ -93,6 +93,15 @@ class SeriesPropagation(SwitchingEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         return _NO_LAGS if asked.what == "fixed-lag" else super().unable(problem, asked)
 
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        named = getattr(self, "families", None)
+        if named:
+            return (
+                f"ExpectationPropagation(families={dict(named)!r}): over time all numbers are normal given the "
+                "modes, and no node has another family; leave families= out"
+            )
+        return super().refusal(problem)
+
     def effort(self, problem: SeriesProblem) -> str:
         run = self._run(problem)
         return (

@@ -1,10 +1,10 @@
 """What later rows say of tables, and finite nodes drawn along whole paths of what is sampled.
 
 Given a path of the sampled nodes the finite ones are hidden Markov models, one for each table. Messages go
-backwards as in any of them: the message to a slice is, for each state there, the density of all rows after it
-along the path. A particle's table times the message, summed, says how well the particle goes with a path; the
-tables of a path's own forward pass times the messages are smoothed ones, and states drawn from the first slice
-on, each given the one before, are joint draws.
+backwards as in any of them: the message to a slice is, for each state there, the density of all rows after
+it along the path. A particle's table times the message, summed, says how well the particle goes with a path;
+the tables of a path's own forward pass times the messages are smoothed ones, and states drawn from the first
+slice on, each given the one before, are joint draws.
 
 References
 ----------
@@ -26,6 +26,8 @@ from bayesmc.engines.marginal.tables.groups import Told
 from bayesmc.engines.marginal.tables.reading import particle_rows
 from bayesmc.engines.marginal.tables.step import Known, TableFilter
 
+#: numbers that are looked at at once
+_ENTRIES = 1 << 18
 #: of each group, logs by path, element and state: densities of later rows
 Messages = tuple[np.ndarray, ...]
 
@@ -79,7 +81,11 @@ def log_evidence_of(
     """
     total = np.zeros(len(of))
     for message, log in zip(messages, tables.logs, strict=True):
-        total += log_sum_exp(message[of] + log[which], axis=-1).sum(axis=-1)
+        step = max(1, _ENTRIES // (log.shape[1] * log.shape[2]))
+        for low in range(0, len(of), step):
+            at = slice(low, low + step)
+            both = message[of[at]] + log[which[at]]
+            total[at] += log_sum_exp(both, axis=-1).sum(axis=-1)
     return total
 
 

@@ -20,9 +20,9 @@ class Tables(NamedTuple):
     logs : tuple of ndarray, shapes (particles, elements, states)
         Of each group, logs of probabilities; of a particle that is impossible, minus infinity throughout.
     past : tuple of tuples of ndarray, shapes (particles or 1, elements or 1, states, states)
-        For one slice before, two, and so on, and each group, the probabilities of the states there (rows) given
-        those of this slice (columns), along the particle's ancestors. A row that comes says nothing more of
-        them, so they are only moved on (Rabiner 1989).
+        For one slice before, two, and so on, and each group, the probabilities of the states there (rows)
+        given those of this slice (columns), along the particle's ancestors. A row that comes says nothing
+        more of them, so they are only moved on (Rabiner 1989).
     """
 
     groups: tuple[Group, ...]
@@ -118,10 +118,19 @@ class Tables(NamedTuple):
 
 def drawn(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Positions along the last axis by the exponentials of logs."""
-    top = log.max(axis=-1, keepdims=True)
-    shares = np.exp(log - np.where(top > -np.inf, top, 0.0)).cumsum(axis=-1)
-    level = rng.random(log.shape[:-1]) * shares[..., -1]
-    return np.minimum((shares <= level[..., None]).sum(axis=-1), log.shape[-1] - 1)
+    states = log.shape[-1]
+    top = np.array(log[..., 0])
+    for k in range(1, states):  # a few states: reductions over a short axis take longer
+        np.maximum(top, log[..., k], out=top)
+    top = np.where(top > -np.inf, top, 0.0)
+    sums = np.exp(log - top[..., None])
+    for k in range(1, states):
+        sums[..., k] += sums[..., k - 1]
+    level = rng.random(log.shape[:-1]) * sums[..., -1]
+    found = np.zeros(level.shape, dtype=np.intp)
+    for k in range(states - 1):
+        found += sums[..., k] <= level
+    return found
 
 
 # ---- private ------------------------------------------------------------------------------------
