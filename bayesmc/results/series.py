@@ -281,9 +281,9 @@ class SeriesPosterior:
         """Monte Carlo standard errors of ``mean(name)``, time first; of each probability, for labels.
 
         Exact answers have none: 0. Those of a filter that approximates and draws nothing (Gaussians that are
-        merged, clusters, tangents, a grid) have an error that is not of chance, and unknown: None. Those of particles come from the families
-        of particles of earlier slices, those of trajectories drawn backwards from which of them share
-        particles (see ``ParticleFilter``); infinite where nobody can tell.
+        merged, clusters, tangents, a grid) have an error that is not of chance, and unknown: None. Those of
+        particles come from the families of particles of earlier slices, those of trajectories drawn backwards
+        from which of them share particles (see ``ParticleFilter``); infinite where nobody can tell.
 
         Raises
         ------

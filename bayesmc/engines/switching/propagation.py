@@ -97,8 +97,8 @@ class SeriesPropagation(SwitchingEngine):
         named = getattr(self, "families", None)
         if named:
             return (
-                f"ExpectationPropagation(families={dict(named)!r}): over time all numbers are normal given the "
-                "modes, and no node has another family; leave families= out"
+                f"ExpectationPropagation(families={dict(named)!r}): over time all numbers are normal given "
+                "the modes, and no node has another family; leave families= out"
             )
         return super().refusal(problem)
 
