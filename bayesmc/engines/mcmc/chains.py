@@ -160,24 +160,7 @@ class ChainEngine(Engine):
         asked = lengths = self.lengths(problem, keep)
         if resume is not None:
             lengths = self._refuse_another(resume, problem, names, summed, lengths)
-        ready = replace(  # type: ignore[type-var]
-            self,
-            draws=lengths.draws,
-            warmup=None if lengths.judge else lengths.warmup,
-            chains=lengths.chains,
-            **({} if self.ess == _ESS else {"ess": _ESS}),
-        )
-        sampler = ready.sampler(problem)
-        if self.start and resume is None:
-            given = read_start(type(self).__name__, problem, self.start, lengths.chains)
-            sampler.given = given  # type: ignore[attr-defined]
-        if lengths.superchains:
-            sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
-        for kernel in getattr(sampler, "kernels", ()):
-            kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
-        tied = self.tied(problem)
-        if tied:
-            _warn_of_ties(type(self).__name__, tied)
+        sampler = self._ready(problem, asked, lengths, resume is None)
         saving = None
         if checkpoint is not None:
             saving = SavedChains(checkpoint, problem, names, spilled)
@@ -213,6 +196,28 @@ class ChainEngine(Engine):
             checkpoint.finish(posterior, lazily)
         self._warn(posterior, sampler, finished, lengths)
         return posterior
+
+    def _ready(self, problem: Problem, asked: Lengths, lengths: Lengths, is_new: bool) -> Sampler:
+        """The sampler of a run, told how long that is and where chains start."""
+        ready = replace(  # type: ignore[type-var]
+            self,
+            draws=lengths.draws,
+            warmup=None if lengths.judge else lengths.warmup,
+            chains=lengths.chains,
+            **({} if self.ess == _ESS else {"ess": _ESS}),
+        )
+        sampler = ready.sampler(problem)
+        if self.start and is_new:
+            given = read_start(type(self).__name__, problem, self.start, lengths.chains)
+            sampler.given = given  # type: ignore[attr-defined]
+        if lengths.superchains:
+            sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
+        for kernel in getattr(sampler, "kernels", ()):
+            kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
+        tied = self.tied(problem)
+        if tied:
+            _warn_of_ties(type(self).__name__, tied)
+        return sampler
 
     def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
         """What a run has come to that has not ended; None where that is nothing."""
@@ -386,5 +391,5 @@ def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
         f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
         "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
         ReducibleWarning,
-        stacklevel=4,
+        stacklevel=5,
     )
