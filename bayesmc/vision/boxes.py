@@ -235,7 +235,7 @@ class BoxDetections:
     """
 
     frame_shape: tuple[int, ...]
-    detected: float = 0.8
+    detected: float = 0.9
     place: float = 0.05
     size: float = 0.15
     clutter: float = 1.0
