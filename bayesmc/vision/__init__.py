@@ -18,8 +18,10 @@ from bayesmc.vision.boxes import (
     precision_recall,
 )
 from bayesmc.vision.contours import Contour, ShapeSpace
+from bayesmc.vision.detector import Detector, train_detector
 from bayesmc.vision.dynamics import SecondOrder, fit_dynamics
 from bayesmc.vision.edges import ContourEdges
+from bayesmc.vision.histograms import Histograms
 from bayesmc.vision.pictures import as_frames, grey
 
 __all__ = [
@@ -27,6 +29,8 @@ __all__ = [
     "BoxMotion",
     "Contour",
     "ContourEdges",
+    "Detector",
+    "Histograms",
     "Scores",
     "SecondOrder",
     "ShapeSpace",
@@ -39,4 +43,5 @@ __all__ = [
     "left_free",
     "padded",
     "precision_recall",
+    "train_detector",
 ]

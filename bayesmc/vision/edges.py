@@ -101,7 +101,7 @@ class ContourEdges:
     clutter: float | None = None
     contrast: float = 1.0
     smoothing: float = 1.5
-    tempering: float = 0.5
+    tempering: float = 0.25
     _fields: Kept = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
