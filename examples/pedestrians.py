@@ -95,7 +95,7 @@ class Tracker:
         height, width = clip.frame_shape
         seen = clip.detections[clip.detections[..., 2] > 0]
         sizes = np.log(seen[:, 2:4]).mean(axis=0) if len(seen) else np.log([width / 10, height / 4])
-        speed = 0.03 * np.exp(sizes[1])
+        speed = 0.05 * np.exp(sizes[1])
         self.start = bmc.MvNormal(
             [width / 2, height / 2, *sizes, 0.0, 0.0],
             scale_diag=[width / 2, height / 2, 0.4, 0.4, speed, speed / 5],
