@@ -1,8 +1,8 @@
 """How well things are followed in pictures, with the goals of each figure: one line per figure.
 
-``python -m benchmarks.bench_vision [NAME ...]``; the names are ``head``, ``silhouette``, ``decoy``, ``detector``,
-``boosted`` and ``pedestrians``, all of them by default. The clips are those of the reference data (``BAYESMC_DATA``,
-else ``../shared/data``); what is not there is left out, and named. MOTA and IDF1 are those of motmetrics, in
+``python -m benchmarks.bench_vision [NAME ...]``; the names are ``head``, ``silhouette``, ``decoy``,
+``detector``, ``boosted`` and ``pedestrians``, all of them by default. The clips are those of the reference data
+(``BAYESMC_DATA``, else ``../shared/data``); what is not there is left out, and named. MOTA and IDF1 are those of motmetrics, in
 the peers' environment (``make peers``; ``BAYESMC_PEERS`` names another).
 """
 
@@ -50,10 +50,13 @@ def head() -> None:
         found = talking_head.errors(clip, talking_head.followed(clip, edges, dynamics, seed))
         seconds = time.process_time() - start - learning
         worst.append(max(found.values()))
-        print(f"  seed {seed}: {', '.join(f'{e:.1f}' for e in found.values())} px; learned in {learning:.0f} s, "
+        each = ", ".join(f"{e:.1f}" for e in found.values())
+        print(f"  seed {seed}: {each} px; learned in {learning:.0f} s, "
               f"{1000 * seconds / len(clip.frames):.0f} ms a frame", flush=True)  # fmt: skip
     good = sum(e <= GOAL_HEAD for e in worst)
-    print(f"  worst {max(worst):.1f} px; within {GOAL_HEAD:g} px: {good} of {len(worst)} seeds (goal: all)")
+    print(
+        f"  worst {max(worst):.1f} px; within {GOAL_HEAD:g} px: {good} of {len(worst)} seeds (goal: all)"
+    )
 
 
 def silhouette() -> None:
@@ -83,13 +86,18 @@ def decoy() -> None:
             found.append(off[-5:].mean())
     for name, found in (("Condensation", ours), ("Kalman filter", theirs)):
         lost = sum(e > LOST for e in found)
-        print(f"  {name}: {', '.join(f'{e:.1f}' for e in found)} px; lost in {lost} of {len(found)}")
+        print(
+            f"  {name}: {', '.join(f'{e:.1f}' for e in found)} px; lost in {lost} of {len(found)}"
+        )
 
 
 def detector() -> None:
     """Precision and recall of detectors on frames that they were not trained on."""
     for name, (precision, recall, *_), frames in (_on_walkers(), _on_the_head()):
-        print(f"  {name}: precision {precision:.2f}, recall {recall:.2f} on {frames} frames", flush=True)
+        print(
+            f"  {name}: precision {precision:.2f}, recall {recall:.2f} on {frames} frames",
+            flush=True,
+        )
 
 
 def boosted_head() -> None:
@@ -107,7 +115,8 @@ def boosted_head() -> None:
         for seed in SEEDS:
             means = _by_histogram(frames, found, reference, guided, seed)
             off.append(np.median(np.hypot(*(means[:, :2] - boxes[test, :2]).T)))
-        print(f"  {name}: median error {', '.join(f'{e:.0f}' for e in off)} px (200 particles, anywhere at first)",
+        each = ", ".join(f"{e:.0f}" for e in off)
+        print(f"  {name}: median error {each} px (200 particles, anywhere at first)",
               flush=True)  # fmt: skip
 
 
@@ -126,7 +135,9 @@ def campus() -> None:
         ("the same, sure boxes only (0.7)", {"least": 0.7}),
         ("the same, coasting longer", {"least": 0.7, "misses": 3}),
     ):
-        _print_score(name, [_score(python, pedestrians.nearest_neighbour(clip, **options), clip.truth)])
+        _print_score(
+            name, [_score(python, pedestrians.nearest_neighbour(clip, **options), clip.truth)]
+        )
     for name, guided in (("boosted", True), ("transition alone", False)):
         found = []
         for seed in SEEDS:
@@ -154,7 +165,9 @@ def main(arguments: Sequence[str] = ()) -> None:
     for name in [name for name in arguments if name in FIGURES] or FIGURES:
         figure, needed = FIGURES[name]
         if needed and not (data_folder() / "vision" / needed).exists():
-            print(f"{name}: no {needed} in {data_folder() / 'vision'}; set BAYESMC_DATA to have this figure")
+            print(
+                f"{name}: no {needed} in {data_folder() / 'vision'}; set BAYESMC_DATA to have this figure"
+            )
             continue
         print(f"{name}: {(figure.__doc__ or '').splitlines()[0]}", flush=True)
         start = time.perf_counter()
@@ -227,13 +240,19 @@ def _by_histogram(
             "initial_proposal": {"box": lambda seen: boosted(start, seen, free)},
         }
     engine = bmc.ParticleFilter(200, **options)
-    return bmc.filter(dbn, {"frame": frames}, inputs={"seen": found}, engine=engine, rng=seed).mean("box")
+    return bmc.filter(dbn, {"frame": frames}, inputs={"seen": found}, engine=engine, rng=seed).mean(
+        "box"
+    )
 
 
 def _score(python: Path, found: list[np.ndarray], true: list[np.ndarray]) -> dict[str, float]:
     given = {"found": [rows.tolist() for rows in found], "true": [rows.tolist() for rows in true]}
     run = subprocess.run(
-        [str(python), str(RUN)], input=json.dumps(given), text=True, capture_output=True, check=False
+        [str(python), str(RUN)],
+        input=json.dumps(given),
+        text=True,
+        capture_output=True,
+        check=False,
     )
     if run.returncode:
         raise RuntimeError(f"motmetrics failed: {run.stderr[-500:]}")

@@ -1,12 +1,12 @@
-"""Pedestrians followed by a boosted particle filter: a detector says where particles are drawn, weights make up.
+"""Pedestrians by a boosted particle filter: a detector says where particles are drawn, weights make up.
 
 Each pedestrian is an element of a plate with particles of its own: present or not, and where its box is. That
 they exclude each other enters by ``claims``: what one is believed to have is less free for the others.
 Detections that nobody has are offered to an element that is vacant. With the same number of particles, drawn
 from the transition alone, a newcomer is found late or never.
 
-The boxes are those of TUD Campus, where there are no frames: a detector's boxes are both proposal and evidence.
-Where the data are missing, a drawn scene takes their place, with a detector trained on another one.
+The boxes are those of TUD Campus, where there are no frames: a detector's boxes are both proposal and
+evidence. Where the data are missing, a drawn scene takes their place, with a detector trained on another one.
 
 Okuma, Taleghani, de Freitas, Little and Lowe (2004), A boosted particle filter: multitarget detection and
 tracking, ECCV; Schulz, Burgard, Fox and Cremers (2001), ICRA; Andriluka, Roth and Schiele (2008),
@@ -225,9 +225,9 @@ def nearest_neighbour(
 ) -> list[np.ndarray]:
     """The plain tracker: a Kalman filter for each box, given the detection that overlaps it most.
 
-    It begins with any detection that is left over, is shown after ``hits`` of them in all, and ends after more
-    than ``misses`` frames without one: the defaults of Bewley et al. (2016), Simple online and realtime tracking.
-    The motion and the noise are those of the particle filter.
+    It begins with any detection that is left over, is shown after ``hits`` of them in all, and ends
+    after more than ``misses`` frames without one: the defaults of Bewley et al. (2016), Simple online
+    and realtime tracking. The motion and the noise are those of the particle filter.
     """
     motion, reads = BoxMotion(), BoxDetections(clip.frame_shape)
     ahead, look = np.eye(6), np.eye(4, 6)
@@ -257,13 +257,19 @@ def nearest_neighbour(
             track.update(missed=0, hits=track["hits"] + 1)
         for j in sorted(left):
             high = seen[j, 3]
-            spread = [(reads.place * high) ** 2] * 2 + [reads.size**2] * 2 + [(0.03 * high) ** 2] * 2
+            spread = (
+                [(reads.place * high) ** 2] * 2 + [reads.size**2] * 2 + [(0.03 * high) ** 2] * 2
+            )
             state = np.r_[seen[j, :2], np.log(seen[j, 2:4]), 0.0, 0.0]
-            tracks.append({"mean": state, "cov": np.diag(spread), "missed": 0, "hits": 1, "which": last})
+            tracks.append(
+                {"mean": state, "cov": np.diag(spread), "missed": 0, "hits": 1, "which": last}
+            )
             last += 1
         tracks = [track for track in tracks if track["missed"] <= misses]
         rows = [
-            [*t["mean"][:2], *np.exp(t["mean"][2:4]), t["which"]] for t in tracks if t["hits"] >= hits
+            [*t["mean"][:2], *np.exp(t["mean"][2:4]), t["which"]]
+            for t in tracks
+            if t["hits"] >= hits
         ]
         found.append(np.array(rows).reshape(-1, 5))
     return found
@@ -294,7 +300,15 @@ def draw(clip: Clip, found: list[np.ndarray]) -> Any:
         for x, y, w, h, which in found[k]:
             colour = picture.pyplot().get_cmap("tab10")(int(which) % 10)
             _box(ax, x, y, w, h, colour, 2.5, "-")
-            ax.text(x, y - h / 2, f"{int(which)}", color=colour, weight="bold", va="bottom", clip_on=True)
+            ax.text(
+                x,
+                y - h / 2,
+                f"{int(which)}",
+                color=colour,
+                weight="bold",
+                va="bottom",
+                clip_on=True,
+            )
         ax.set(xlim=(0, width), ylim=(height, 0), aspect="equal", title=f"frame {k + 1}")
     return figure
 
@@ -325,9 +339,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _box(ax: Any, x: float, y: float, w: float, h: float, colour: Any, width: float, style: str) -> None:
+def _box(
+    ax: Any, x: float, y: float, w: float, h: float, colour: Any, width: float, style: str
+) -> None:
     left, right, top, bottom = x - w / 2, x + w / 2, y - h / 2, y + h / 2
-    ax.plot([left, right, right, left, left], [top, top, bottom, bottom, top], style, c=colour, lw=width)
+    ax.plot(
+        [left, right, right, left, left], [top, top, bottom, bottom, top], style, c=colour, lw=width
+    )
 
 
 if __name__ == "__main__":

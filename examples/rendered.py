@@ -54,7 +54,9 @@ def outline(kind: str = "bean", radius: float = 22.0) -> Contour:
         "egg": 1 + 0.15 * np.cos(turn),
     }
     stretch = {"bean": (1.0, 1.2), "star": (1.0, 1.0), "egg": (1.35, 0.9)}[kind]
-    points = radius * waves[kind][:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1) * stretch
+    points = (
+        radius * waves[kind][:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=-1) * stretch
+    )
     return Contour.through(points + [WIDTH / 2, HEIGHT / 2], 16 if kind == "star" else 12)
 
 

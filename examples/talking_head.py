@@ -2,11 +2,13 @@
 
 The outline is an ellipse that an affine map moves; a second-order process says how; each particle is weighed
 by the edges of the frame along its normals, among clutter. The dynamics are learned from the first half
-of the clip: a run with plain ones (speeds that die away) gives trajectories, and these are what is learned from.
+of the clip: a run with plain ones (speeds that die away) gives trajectories, and these are what is
+learned from.
 
-Carphone is a head before striped blinds. Where it is not at hand, a drawn silhouette takes its place. The last
-picture is a drawn scene in which a second outline of the same shape is met: a Kalman filter given the nearest
-edges goes off with it; particles hold both to be possible until one of them has left the frame.
+Carphone is a head before striped blinds. Where it is not at hand, a drawn silhouette takes its place.
+The last picture is a drawn scene in which a second outline of the same shape is met: a Kalman filter
+given the nearest edges goes off with it; particles hold both to be possible until one of them has left
+the frame.
 
 Isard and Blake (1998), CONDENSATION: conditional density propagation for visual tracking, IJCV 29; North and
 Blake (1998), Learning dynamical models using expectation-maximisation, ICCV.
@@ -37,9 +39,16 @@ from examples.rendered import Scene
 
 SEED, PARTICLES, MANY = 0, 1000, 4000
 TRAINING, TRAJECTORIES = 60, 100  # frames, and paths that are learned from
-NOISE, DAMPING = 1.0, 0.5  # px per frame squared of the place (a third of it in shape); of plain dynamics
+NOISE, DAMPING = (
+    1.0,
+    0.5,
+)  # px per frame squared of the place (a third of it in shape); of plain dynamics
+DOUBT = 0.25  # tempering where it is met by another: the less, the longer several hypotheses live
 AHEAD = 0.4  # the same where it is met by another
-SUDDEN, AWAY = 0.05, 3.0  # probability in a frame of stopping short, and the speed in px with which it goes on
+SUDDEN, AWAY = (
+    0.05,
+    3.0,
+)  # probability in a frame of stopping short, and the speed in px with which it goes on
 
 
 class Clip(NamedTuple):
@@ -112,7 +121,11 @@ def learned(clip: Clip, edges: ContourEdges, frames: int = TRAINING, rng: int = 
 
 
 def followed(
-    clip: Clip, edges: ContourEdges, dynamics: SecondOrder, rng: int = SEED, particles: int = PARTICLES
+    clip: Clip,
+    edges: ContourEdges,
+    dynamics: SecondOrder,
+    rng: int = SEED,
+    particles: int = PARTICLES,
 ) -> np.ndarray:
     """Means of the states, (time, size)."""
     dbn = model(edges, dynamics.given, clip.start)
@@ -132,7 +145,7 @@ def errors(clip: Clip, states: np.ndarray) -> dict[int, float]:
 
 
 def sudden(dynamics: SecondOrder) -> Callable[[Any, Any], Any]:
-    """The same, but now and then it stops short and goes on in any direction: no Kalman filter's transition."""
+    """The same, but now and then it stops short and goes on in any direction, which is not Gaussian."""
     root = dynamics.root.copy()
     root[0, 0] = root[1, 1] = AWAY
 
@@ -145,7 +158,10 @@ def sudden(dynamics: SecondOrder) -> Callable[[Any, Any], Any]:
 
 def met(scene: Scene, rng: int = SEED, particles: int = MANY) -> Any:
     """Condensation in a scene with a decoy; the particles of all slices."""
-    edges, speed = ContourEdges(scene.space, scene.frames.shape[1:]), scene.states[1] - scene.states[0]
+    edges, speed = (
+        ContourEdges(scene.space, scene.frames.shape[1:], tempering=DOUBT),
+        scene.states[1] - scene.states[0],
+    )
     dynamics = SecondOrder.steady(scene.space.size, [AHEAD, AHEAD, 0.1, 0.1])
     dbn = model(edges, sudden(dynamics), scene.states[0], speed)
     engine = bmc.ParticleFilter(particles)
@@ -166,7 +182,9 @@ def kalman(scene: Scene) -> np.ndarray:
     ahead = np.block([[dynamics.last, dynamics.earlier], [np.eye(size), np.zeros((size, size))]])
     spread = np.concatenate([noise, np.full(size, 1e-3)])
 
-    @dbn.node(initial=bmc.MvNormal(first, scale_diag=np.concatenate([[1.5, 1.5, 1.0, 1.0], [0.1] * 4])))
+    @dbn.node(
+        initial=bmc.MvNormal(first, scale_diag=np.concatenate([[1.5, 1.5, 1.0, 1.0], [0.1] * 4]))
+    )
     def both(both_prev):
         return bmc.MvNormal(np.matvec(ahead, both_prev), scale_diag=spread)
 
@@ -190,7 +208,10 @@ def kalman(scene: Scene) -> np.ndarray:
 def report(name: str, found: dict[int, float]) -> None:
     """Print how far off the middle is."""
     shown = list(found.items())[:: max(1, len(found) // 8)]
-    print(f"  {name}: worst {max(found.values()):.1f} px; " + ", ".join(f"{k}: {e:.1f}" for k, e in shown))
+    print(
+        f"  {name}: worst {max(found.values()):.1f} px; "
+        + ", ".join(f"{k}: {e:.1f}" for k, e in shown)
+    )
 
 
 def draw(clip: Clip, states: np.ndarray) -> Any:
@@ -241,7 +262,9 @@ def animate(clip: Clip, states: np.ndarray, folder: Path, name: str) -> None:
         return image, line
 
     folder.mkdir(parents=True, exist_ok=True)
-    FuncAnimation(figure, show, frames=len(states)).save(folder / f"{name}.gif", PillowWriter(fps=12), dpi=70)
+    FuncAnimation(figure, show, frames=len(states)).save(
+        folder / f"{name}.gif", PillowWriter(fps=12), dpi=70
+    )
     picture.pyplot().close(figure)
     print(f"wrote {folder / name}.gif")
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.parameters import as_number
+from bayesmc.distributions.parameters import as_number as as_number  # handed on to the room
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.expression import as_one_call
 from bayesmc.shapes import first_index, read_only

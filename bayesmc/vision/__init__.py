@@ -1,8 +1,8 @@
-"""Things in pictures, followed: outlines, edges, boxes and detectors, each piece a density for any dynamic Bayes net.
+"""Things followed in pictures: outlines, edges, boxes, detectors, each a density for any dynamic Bayes net.
 
-Nothing here filters: what is believed about a thing is that of a ``DynamicBayesNet`` whose transition is one of
-``dynamics`` or ``boxes`` and whose frames are weighed by ``edges``, ``histograms`` or ``boxes``. Lengths are
-pixels, times frames; points are (x, y), y down.
+Nothing here filters: what is believed about a thing is that of a ``DynamicBayesNet`` whose transition is
+one of ``dynamics`` or ``boxes`` and whose frames are weighed by ``edges``, ``histograms`` or ``boxes``.
+Lengths are pixels, times frames; points are (x, y), y down.
 """
 
 from __future__ import annotations

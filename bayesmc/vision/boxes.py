@@ -1,8 +1,9 @@
 """Boxes around things: what a detector says of them, where a detector sends particles, and how well it does.
 
-A detector's boxes in a frame are rows ``(x, y, width, height, score)``: the middle in px, the size in px, and the
-probability that there is something, as the detector has it. Frames have different numbers of them, so arrays
-over time are filled up with rows of zeros; a row without width is no detection (``padded`` makes them).
+A detector's boxes in a frame are rows ``(x, y, width, height, score)``: the middle in px, the size in
+px, and the probability that there is something, as the detector has it. Frames have different numbers of
+them, so arrays over time are filled up with rows of zeros; a row without width is no detection
+(``padded`` makes them).
 
 What is followed has a state ``(x, y, log width, log height, speed_x, speed_y)``, in px and px per frame.
 """
@@ -65,11 +66,15 @@ def padded(frames: Sequence[Any], most: int | None = None) -> np.ndarray:
     >>> padded([[[10.0, 20.0, 4.0, 8.0, 0.9]], []]).shape
     (2, 1, 5)
     """
-    rows = [as_float(frame).reshape(-1, 5) if np.size(frame) == 0 else as_float(frame) for frame in frames]
+    rows = [
+        as_float(frame).reshape(-1, 5) if np.size(frame) == 0 else as_float(frame)
+        for frame in frames
+    ]
     for k, row in enumerate(rows):
         if row.ndim != 2 or row.shape[1] != 5:
             raise ShapeError(
-                f"padded: the detections of frame {k} have shape {row.shape}; give rows (x, y, width, height, score)"
+                f"padded: the detections of frame {k} have shape {row.shape}; give rows (x, y, width, "
+                f"height, score)"
             )
         if not np.isfinite(row).all() or not (row[:, 2:4] > 0).all():
             raise ParameterError(
@@ -145,7 +150,11 @@ def precision_recall(found: Sequence[Any], true: Sequence[Any], overlap: float =
             good = iou(ours, theirs) >= overlap
             hits += int(good[linear_sum_assignment(good, maximize=True)].sum())
     return Scores(
-        hits / claimed if claimed else math.nan, hits / there if there else math.nan, hits, claimed, there
+        hits / claimed if claimed else math.nan,
+        hits / there if there else math.nan,
+        hits,
+        claimed,
+        there,
     )
 
 
@@ -182,7 +191,9 @@ class BoxMotion:
     def __post_init__(self) -> None:
         for name in ("place", "speed", "size"):
             if not 0 < as_number(getattr(self, name)) < math.inf:
-                raise ParameterError(f"BoxMotion: {name} must be positive; got {getattr(self, name)!r:.60}")
+                raise ParameterError(
+                    f"BoxMotion: {name} must be positive; got {getattr(self, name)!r:.60}"
+                )
         if not 0 <= as_number(self.damping) <= 1:
             raise ParameterError(f"BoxMotion: damping must lie in 0..1; got {self.damping!r:.60}")
 
@@ -266,7 +277,11 @@ class BoxDetections:
         Density
             Of arrays (most, 5), up to the density of clutter; it cannot be drawn from.
         """
-        box, present, free = _states("BoxDetections.given", box), np.asarray(present), as_float(free)
+        box, present, free = (
+            _states("BoxDetections.given", box),
+            np.asarray(present),
+            as_float(free),
+        )
         most = free.shape[-1]
         batch = np.broadcast_shapes(box.shape[:-1], present.shape, free.shape[:-1])
 
@@ -304,17 +319,27 @@ class BoxDetections:
             log = log - 0.5 * ((value - box[..., k]) ** 2 / var + np.log(var))
         score = np.clip(seen[..., 4], _SURE, 1 - _SURE)
         # clutter is spread evenly over the frame, and over a factor of e^2 in width and in height
-        log = log + np.log(score / (1 - score)) + math.log(4.0 * self.frame_shape[0] * self.frame_shape[1])
+        log = (
+            log
+            + np.log(score / (1 - score))
+            + math.log(4.0 * self.frame_shape[0] * self.frame_shape[1])
+        )
         return np.where(there, self.detected * np.exp(np.minimum(log, 500.0)), 0.0)
 
 
 def boosted(
-    prior: MvNormal, seen: Any, free: Any, place: float = 0.05, size: float = 0.15, share: float = 0.5
+    prior: MvNormal,
+    seen: Any,
+    free: Any,
+    place: float = 0.05,
+    size: float = 0.15,
+    share: float = 0.5,
 ) -> Distribution:
     """A transition mixed with a detector's boxes: the proposal of the boosted particle filter.
 
-    ``(1 - share w) prior + share sum_j w_j Normal(box_j)``: each box has the weight ``free`` times its score (over
-    their sum, where that is above 1), and speeds are those of ``prior``. Where no box is free it is ``prior``.
+    ``(1 - share w) prior + share sum_j w_j Normal(box_j)``: each box has the weight ``free`` times its
+    score (over their sum, where that is above 1), and speeds are those of ``prior``. Where no box is
+    free it is ``prior``.
 
     Parameters
     ----------
@@ -350,7 +375,8 @@ def boosted(
     """
     if not 0 <= as_number(share) < 1:
         raise ParameterError(
-            f"boosted: share must be 0 or more and below 1, or what the detector misses is never drawn; got {share!r:.60}"
+            f"boosted: share must be 0 or more and below 1, or what the detector misses is never "
+            f"drawn; got {share!r:.60}"
         )
     seen, free = as_float(seen), as_float(free)
     there = seen[..., 2] > 0
@@ -361,7 +387,13 @@ def boosted(
     box = np.where(there[..., None], seen, 1.0)
     middle = np.concatenate([box[..., :2], np.log(box[..., 2:4])], axis=-1)
     near = np.stack(
-        [place * box[..., 3], place * box[..., 3], np.full(there.shape, size), np.full(there.shape, size)], axis=-1
+        [
+            place * box[..., 3],
+            place * box[..., 3],
+            np.full(there.shape, size),
+            np.full(there.shape, size),
+        ],
+        axis=-1,
     )
     lead = np.broadcast_shapes(mean.shape[:-2], there.shape[:-1])
     most = there.shape[-1]
@@ -381,6 +413,7 @@ def _states(what: str, box: Any) -> np.ndarray:
     box = as_float(box)
     if box.shape[-1:] != (STATE,):
         raise ShapeError(
-            f"{what}: states have shape {box.shape}; give (..., 6): x, y, log width, log height, speed_x, speed_y"
+            f"{what}: states have shape {box.shape}; give (..., 6): x, y, log width, log height, "
+            f"speed_x, speed_y"
         )
     return box

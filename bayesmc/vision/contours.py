@@ -170,7 +170,8 @@ class ShapeSpace:
     References
     ----------
     Isard and Blake (1998), CONDENSATION: conditional density propagation for visual tracking, IJCV 29,
-    section 4.1 and the shape space of planar affine maps; Blake and Isard (1998), Active Contours, section 4.3.
+    section 4.1 and the shape space of planar affine maps; Blake and Isard (1998), Active Contours,
+    section 4.3.
 
     Examples
     --------
@@ -190,7 +191,8 @@ class ShapeSpace:
     def __post_init__(self) -> None:
         if not isinstance(self.template, Contour):
             raise TypeError(
-                f"ShapeSpace: template must be a Contour, such as Contour.ellipse(...); got {self.template!r:.60}"
+                f"ShapeSpace: template must be a Contour, such as Contour.ellipse(...); got "
+                f"{self.template!r:.60}"
             )
         if self.kind not in _DEFORMATIONS:
             raise ParameterError(
@@ -243,7 +245,9 @@ class ShapeSpace:
     def basis(self, count: int) -> np.ndarray:
         """How points along the outline move with the state, shape (count, 2, size): linear throughout."""
         unit = np.eye(self.size)
-        return np.moveaxis(self.points(unit, count) - self.points(np.zeros(self.size), count), 0, -1)
+        return np.moveaxis(
+            self.points(unit, count) - self.points(np.zeros(self.size), count), 0, -1
+        )
 
     def state_of(self, contour: Contour) -> np.ndarray:
         """The state whose outline is nearest to a contour of as many control points, by least squares.
@@ -253,10 +257,14 @@ class ShapeSpace:
         ShapeError
             The contours have different numbers of control points, or one is closed and the other not.
         """
-        if contour.control.shape != self.template.control.shape or contour.closed != self.template.closed:
+        if (
+            contour.control.shape != self.template.control.shape
+            or contour.closed != self.template.closed
+        ):
             raise ShapeError(
                 f"ShapeSpace.state_of: the contour has {len(contour.control)} control points (closed: "
-                f"{contour.closed}), the template {len(self.template.control)} (closed: {self.template.closed})"
+                f"{contour.closed}), the template {len(self.template.control)} (closed: "
+                f"{self.template.closed})"
             )
         design = self.basis(200).reshape(400, self.size)
         apart = contour.points(200) - self.template.points(200)
@@ -266,7 +274,8 @@ class ShapeSpace:
         state = as_float(state)
         if state.shape[-1:] != (self.size,):
             raise ShapeError(
-                f"ShapeSpace: states have shape {state.shape}; {self.kind} ones have {self.size} components on "
+                f"ShapeSpace: states have shape {state.shape}; {self.kind} ones have {self.size} "
+                f"components on "
                 "the last axis"
             )
         return state
@@ -292,4 +301,3 @@ def _basis(control: int, places: np.ndarray, closed: bool, derivative: int = 0) 
         return np.roll(found, -2, axis=1)  # the weights at place 0 are greatest at point 0
     knots = np.concatenate([np.zeros(3), np.linspace(0, 1, control - 2), np.ones(3)])
     return BSpline(knots, np.eye(control), 3).derivative(derivative)(places)
-

@@ -1,4 +1,4 @@
-"""A detector of things in frames: AdaBoost over Haar features, trained on patches that are cut from frames."""
+"""A detector of things in frames: AdaBoost over Haar features, trained on patches cut from frames."""
 
 from __future__ import annotations
 
@@ -74,7 +74,9 @@ class Detector:
             top, left = (
                 part.ravel()
                 for part in np.meshgrid(
-                    np.arange(0, spare[0] + 1, step[0]), np.arange(0, spare[1] + 1, step[1]), indexing="ij"
+                    np.arange(0, spare[0] + 1, step[0]),
+                    np.arange(0, spare[1] + 1, step[1]),
+                    indexing="ij",
                 )
             )
             score = self._probability(ours.of(small, top, left))
@@ -114,8 +116,8 @@ def train_detector(
 ) -> Detector:
     """A detector of what lies in boxes, against everything else in the same frames.
 
-    Patches are cut at the boxes, moved and scaled a little, and elsewhere at random; stumps on Haar features are
-    boosted. Windows of training frames that are taken for the thing and are not are added to the
+    Patches are cut at the boxes, moved and scaled a little, and elsewhere at random; stumps on Haar
+    features are boosted. Windows of training frames that are taken for the thing and are not are added to the
     background, and it is trained again. Probabilities are those of a logistic regression on the margins of
     patches that were held back.
 
@@ -148,8 +150,9 @@ def train_detector(
     References
     ----------
     Okuma et al. (2004), A boosted particle filter, ECCV, section 3; Viola and Jones (2001), Rapid object
-    detection using a boosted cascade of simple features, CVPR; Freund and Schapire (1997), A decision-theoretic
-    generalization of on-line learning, JCSS 55; Platt (1999), Probabilistic outputs for support vector machines.
+    detection using a boosted cascade of simple features, CVPR; Freund and Schapire (1997), A
+    decision-theoretic generalization of on-line learning, JCSS 55; Platt (1999), Probabilistic outputs
+    for support vector machines.
     """
     pictures = grey(as_frames(frames))
     given = _checked(pictures, boxes)
@@ -187,20 +190,26 @@ def resized(frame: np.ndarray, scale: float) -> np.ndarray:
 def _checked(pictures: np.ndarray, boxes: Sequence[Any]) -> list[np.ndarray]:
     if len(boxes) != len(pictures):
         raise ShapeError(
-            f"train_detector: there are {len(pictures)} frames and boxes of {len(boxes)}; give one set for each"
+            f"train_detector: there are {len(pictures)} frames and boxes of {len(boxes)}; give one "
+            f"set for each"
         )
-    found = [as_float(rows).reshape(-1, 4) if np.size(rows) == 0 else as_float(rows) for rows in boxes]
+    found = [
+        as_float(rows).reshape(-1, 4) if np.size(rows) == 0 else as_float(rows) for rows in boxes
+    ]
     height, width = pictures.shape[1:]
     for k, rows in enumerate(found):
         if rows.ndim != 2 or rows.shape[1] < 4:
             raise ShapeError(
-                f"train_detector: the boxes of frame {k} have shape {rows.shape}; give rows (x, y, width, height)"
+                f"train_detector: the boxes of frame {k} have shape {rows.shape}; give rows (x, y, "
+                f"width, height)"
             )
         if not np.isfinite(rows).all() or not (rows[:, 2:4] > 0).all():
             raise ParameterError(f"train_detector: a box of frame {k} is not finite or has no size")
         near = np.abs(rows[:, :2] - [width / 2, height / 2]) < (rows[:, 2:4] + [width, height]) / 2
         if not near.all():
-            raise ParameterError(f"train_detector: a box of frame {k} lies outside the frame: {rows[~near.all(axis=1)][0]}")
+            raise ParameterError(
+                f"train_detector: a box of frame {k} lies outside the frame: {rows[~near.all(axis=1)][0]}"
+            )
     if sum(map(len, found)) < 2:
         raise ParameterError("train_detector: give two boxes or more")
     return [rows[:, :4] for rows in found]
@@ -218,7 +227,9 @@ def _things(
                 small = resized(frame, scale)
                 top = (box[1] + 0.5) * scale - drawn.height / 2 + rng.integers(-1, 2, 4)
                 left = (box[0] + 0.5) * scale - drawn.width / 2 + rng.integers(-1, 2, 4)
-                found.append(_cut(small, np.rint(top).astype(int), np.rint(left).astype(int), drawn))
+                found.append(
+                    _cut(small, np.rint(top).astype(int), np.rint(left).astype(int), drawn)
+                )
     return np.concatenate(found)
 
 
@@ -232,7 +243,11 @@ def _cut(small: np.ndarray, top: np.ndarray, left: np.ndarray, drawn: HaarFeatur
 
 
 def _others(
-    pictures: np.ndarray, boxes: list[np.ndarray], drawn: HaarFeatures, count: int, rng: np.random.Generator
+    pictures: np.ndarray,
+    boxes: list[np.ndarray],
+    drawn: HaarFeatures,
+    count: int,
+    rng: np.random.Generator,
 ) -> np.ndarray:
     """Features of windows of background, at the scales of the boxes."""
     heights, found = np.concatenate(boxes)[:, 3], []

@@ -153,7 +153,8 @@ def fit_dynamics(states: Any, prior: float = 60.0) -> SecondOrder:
         Where the thing was; leading axes are stretches of their own, such as trajectories drawn by
         ``bmc.smooth``, which carry what is uncertain about it: means alone leave the noise too small.
     prior : float
-        Weight of the shrinkage, in observations of each component's typical change: 0 for plain least squares.
+        Weight of the shrinkage, in observations of each component's typical change: 0 for plain least
+        squares.
 
     Raises
     ------
@@ -181,7 +182,8 @@ def fit_dynamics(states: Any, prior: float = 60.0) -> SecondOrder:
     x = as_float(states)
     if x.ndim < 2 or x.shape[-2] < 3:
         raise ShapeError(
-            f"fit_dynamics: states have shape {x.shape}; give (..., time, size) with three or more of them in time"
+            f"fit_dynamics: states have shape {x.shape}; give (..., time, size) with three or more "
+            f"of them in time"
         )
     if not np.isfinite(x).all():
         raise ParameterError("fit_dynamics: states must be finite")
@@ -195,7 +197,9 @@ def fit_dynamics(states: Any, prior: float = 60.0) -> SecondOrder:
     left = (apart[..., 2:, :] - z - v).reshape(-1, size)
     design = np.concatenate([z, v, np.ones((*z.shape[:-1], 1))], axis=-1).reshape(-1, 2 * size + 1)
     typical = np.sqrt((design**2).mean(axis=0))
-    ridge = np.diag(prior * stretches * np.where(np.arange(2 * size + 1) < 2 * size, typical, 0.0) ** 2)
+    ridge = np.diag(
+        prior * stretches * np.where(np.arange(2 * size + 1) < 2 * size, typical, 0.0) ** 2
+    )
     found = np.linalg.lstsq(
         np.vstack([design, np.sqrt(ridge)]), np.vstack([left, np.zeros((2 * size + 1, size))]),
         rcond=None,
@@ -229,4 +233,6 @@ def _about(
         shrunk = 0.99 / largest
         last, earlier = last * shrunk, earlier * shrunk**2
         return SecondOrder(mean, last, earlier, root)
-    return SecondOrder(mean + np.linalg.solve(np.eye(size) - last - earlier, rest), last, earlier, root)
+    return SecondOrder(
+        mean + np.linalg.solve(np.eye(size) - last - earlier, rest), last, earlier, root
+    )

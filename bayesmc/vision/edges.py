@@ -1,8 +1,8 @@
 """How well a frame's edges lie along a contour: features on its normals, among clutter.
 
-Along each normal of a contour the strongest changes of brightness are features. One of them may be the outline
-of the thing that is followed; the others are clutter, and the outline may have been missed. What comes out is
-a ratio: the density of the features with the thing there over that without it.
+Along each normal of a contour the strongest changes of brightness are features. One of them may be the
+outline of the thing that is followed; the others are clutter, and the outline may have been missed. What
+comes out is a ratio: the density of the features with the thing there over that without it.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from bayesmc.distributions.base import as_float
+from bayesmc.distributions.parameters import as_number
 from bayesmc.errors import ParameterError
 from bayesmc.expression import as_one_call
-from bayesmc.distributions.parameters import as_number
 from bayesmc.shapes import Shape
 from bayesmc.vision.contours import ShapeSpace
 from bayesmc.vision.pictures import Kept, OfFrame, check_frame_shape, grey
@@ -101,7 +101,7 @@ class ContourEdges:
     clutter: float | None = None
     contrast: float = 1.0
     smoothing: float = 1.5
-    tempering: float = 0.25
+    tempering: float = 0.5
     _fields: Kept = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -123,7 +123,8 @@ class ContourEdges:
                 )
         if not 0 < as_number(self.missed) < 1:
             raise ParameterError(
-                f"ContourEdges: missed must lie between 0 and 1; got {self.missed!r:.60}: at 0 a single normal "
+                f"ContourEdges: missed must lie between 0 and 1; got {self.missed!r:.60}: at 0 a "
+                f"single normal "
                 "without a feature would rule a state out"
             )
         if not isinstance(self.lines, (int, np.integer)) or self.lines < 1:
@@ -184,14 +185,16 @@ class ContourEdges:
         for start in range(0, len(states), step):
             part = slice(start, start + step)
             found, offsets = self._features(prepared, states[part])
-            near = np.exp(-0.5 * (offsets / self.sigma) ** 2) / (math.sqrt(2 * math.pi) * self.sigma)
+            near = np.exp(-0.5 * (offsets / self.sigma) ** 2) / (
+                math.sqrt(2 * math.pi) * self.sigma
+            )
             near = near.astype(np.float32)
             ratio = self.missed + (1 - self.missed) / rate * (found.astype(np.float32) @ near)
             log[part] = np.log(ratio).sum(axis=-1)
         return self.tempering * log
 
     def _prepared(self, frame: np.ndarray) -> _Prepared:
-        """Changes of brightness to the right and down, what counts as a feature, and how many there are per px."""
+        """Changes of brightness to the right and down, what is a feature, and how many there are per px."""
         smooth = gaussian_filter(grey(frame), self.smoothing, mode="nearest")
         down, right = np.gradient(smooth)
         least = max(self.contrast * float(np.sqrt((right**2 + down**2).mean() / 2)), 1e-9)
@@ -202,9 +205,7 @@ class ContourEdges:
         )
         return (right.ravel(), down.ravel(), right.shape[1]), least, rate
 
-    def _features(
-        self, prepared: _Prepared, states: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _features(self, prepared: _Prepared, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where on the normals of states there are features, (n, lines, offsets), and the offsets in px."""
         (right, down, width), least, _ = prepared
         reach = int(np.ceil(float(self.reach or 0)))

@@ -21,7 +21,9 @@ def integral(frame: np.ndarray) -> np.ndarray:
     return found
 
 
-def rectangle_sums(sums: np.ndarray, low_y: Any, low_x: Any, high_y: Any, high_x: Any) -> np.ndarray:
+def rectangle_sums(
+    sums: np.ndarray, low_y: Any, low_x: Any, high_y: Any, high_x: Any
+) -> np.ndarray:
     """Sums over rows low_y..high_y - 1 and columns low_x..high_x - 1 of an ``integral``."""
     width, flat = sums.shape[1], sums.ravel()
     top, bottom = np.asarray(low_y) * width, np.asarray(high_y) * width
@@ -73,7 +75,9 @@ class HaarFeatures:
             every, _ = haar_like_feature_coord(width, height, kind)
             if not len(every):
                 raise ParameterError(f"HaarFeatures: no {kind} fits into {height} x {width} px")
-            for k in rng.choice(len(every), min(len(every), -(-count // len(KINDS))), replace=False):
+            for k in rng.choice(
+                len(every), min(len(every), -(-count // len(KINDS))), replace=False
+            ):
                 corner, sign = np.zeros((4, 4), dtype=np.intp), np.zeros(4)
                 for j, ((top, left), (bottom, right)) in enumerate(every[k]):
                     corner[j] = top, left, bottom + 1, right + 1
@@ -89,7 +93,7 @@ class HaarFeatures:
         return HaarFeatures(self.height, self.width, self.corners, read_only(signs))
 
     def of(self, frame: np.ndarray, top: Any, left: Any) -> np.ndarray:
-        """Features of the windows of a grey frame whose first rows and columns are given, (windows, features).
+        """Features of windows of a grey frame by their first rows and columns, shape (windows, features).
 
         Examples
         --------

@@ -23,9 +23,10 @@ _FAINT = 0.1
 class Histograms:
     """Densities of frames given the box of a thing whose histogram is known.
 
-    With the Bhattacharyya distance ``d^2 = 1 - sum_b sqrt(h_b reference_b)`` of a box's histogram h, the density
-    over that of background alone is ``exp(sharpness (background - d^2))``. Of grey frames the bins are of
-    brightness; of colour, of hue and saturation (bins x bins), and of value where there is no hue.
+    With the Bhattacharyya distance ``d^2 = 1 - sum_b sqrt(h_b reference_b)`` of a box's histogram h, the
+    density over that of background alone is ``exp(sharpness (background - d^2))``. Of grey frames the
+    bins are of brightness; of colour, of hue and saturation (bins x bins), and of value where there is
+    no hue.
 
     Parameters
     ----------
@@ -73,12 +74,20 @@ class Histograms:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "frame_shape", check_frame_shape("Histograms", self.frame_shape))
-        if isinstance(self.bins, bool) or not isinstance(self.bins, (int, np.integer)) or self.bins < 2:
+        if (
+            isinstance(self.bins, bool)
+            or not isinstance(self.bins, (int, np.integer))
+            or self.bins < 2
+        ):
             raise ParameterError(f"Histograms: bins must be 2 or more; got {self.bins!r:.60}")
         if not 0 < as_number(self.sharpness) < math.inf:
-            raise ParameterError(f"Histograms: sharpness must be positive; got {self.sharpness!r:.60}")
+            raise ParameterError(
+                f"Histograms: sharpness must be positive; got {self.sharpness!r:.60}"
+            )
         if not 0 <= as_number(self.background) <= 1:
-            raise ParameterError(f"Histograms: background must lie in 0..1; got {self.background!r:.60}")
+            raise ParameterError(
+                f"Histograms: background must lie in 0..1; got {self.background!r:.60}"
+            )
         if self.reference is not None:
             reference = as_float(self.reference)
             if reference.shape != (self.cells,):
@@ -115,7 +124,9 @@ class Histograms:
         """
         frame, boxes = as_float(frame), as_float(boxes)
         if frame.shape != self.frame_shape:
-            raise ShapeError(f"Histograms: the frame has shape {frame.shape}, not {self.frame_shape}")
+            raise ShapeError(
+                f"Histograms: the frame has shape {frame.shape}, not {self.frame_shape}"
+            )
         return self._shares(frame, boxes)
 
     @as_one_call
@@ -130,11 +141,16 @@ class Histograms:
             There is no reference.
         """
         if self.reference is None:
-            raise ParameterError("Histograms.given: there is no reference= to compare with; Histograms.of makes one")
+            raise ParameterError(
+                "Histograms.given: there is no reference= to compare with; Histograms.of makes one"
+            )
         box, present = as_float(box), np.asarray(present, dtype=float)
         lead = np.broadcast_shapes(box.shape[:-1], present.shape)
         states = np.empty((*lead, 5))
-        states[..., :2], states[..., 2:4] = box[..., :2], np.exp(np.clip(box[..., 2:4], -20.0, 20.0))
+        states[..., :2], states[..., 2:4] = (
+            box[..., :2],
+            np.exp(np.clip(box[..., 2:4], -20.0, 20.0)),
+        )
         states[..., 4] = present
         return OfFrame(self._score, states, self.frame_shape)
 

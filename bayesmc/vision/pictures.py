@@ -49,7 +49,8 @@ def as_frames(frames: Any) -> np.ndarray:
     (2, 4, 6)
     >>> as_frames([np.zeros((4, 6)), np.ones((6, 4))])
     Traceback (most recent call last):
-    bayesmc.errors.ShapeError: as_frames: frame 1 has shape (6, 4), and frame 0 (4, 6); give frames of one size
+        ...
+    bayesmc.errors.ShapeError: as_frames: frame 1 has shape (6, 4), and frame 0 (4, 6); give ...
     """
     several = list(frames) if isinstance(frames, np.ndarray) or np.iterable(frames) else [frames]
     if not several:
@@ -125,9 +126,7 @@ class OfFrame(Density):
         pictures = x.reshape(lead + self.event_shape)
         states, found = np.broadcast_to(self.states, whole + size), np.empty(whole)
         for index in np.ndindex(*lead):
-            at = tuple(
-                i if n > 1 else slice(None) for i, n in zip(index, lead, strict=True)
-            )
+            at = tuple(i if n > 1 else slice(None) for i, n in zip(index, lead, strict=True))
             part = states[at]
             scores = self._score(pictures[index], part.reshape(-1, *size))
             found[at] = scores.reshape(part.shape[:-1])

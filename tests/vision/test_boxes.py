@@ -30,9 +30,9 @@ SHAPE = (100, 200)
 
 
 def test_overlap_and_scores() -> None:
-    assert iou([[5, 5, 10, 10]], [[5, 5, 10, 10], [10, 5, 10, 10], [50, 50, 1, 1]]).round(3).tolist() == [
-        [1.0, 0.333, 0.0]
-    ]
+    assert iou([[5, 5, 10, 10]], [[5, 5, 10, 10], [10, 5, 10, 10], [50, 50, 1, 1]]).round(
+        3
+    ).tolist() == [[1.0, 0.333, 0.0]]
     one, far = [5.0, 5.0, 10.0, 10.0], [90.0, 5.0, 10.0, 10.0]
     found = precision_recall([[one, one, far], []], [[one], [one]])  # doubles do not count twice
     assert found == (1 / 3, 1 / 2, 1, 3, 2)
@@ -160,7 +160,9 @@ def synthetic(seed: int = 0) -> pedestrians.Clip:
         noisy = seen[:, :4] + rng.normal(size=(len(seen), 4)) * [1.0, 1.0, 0.5, 1.0]
         found = [np.append(row, rng.uniform(0.7, 0.99)) for row in noisy]
         if rng.random() < 0.2:
-            found.append(np.array([*rng.uniform([0, 40], [160, 90]), 15.0, 38.0, rng.uniform(0.3, 0.6)]))
+            found.append(
+                np.array([*rng.uniform([0, 40], [160, 90]), 15.0, 38.0, rng.uniform(0.3, 0.6)])
+            )
         rows.append(np.array(found).reshape(-1, 5))
     return pedestrians.Clip("made", padded(rows), made.boxes, (rendered.HEIGHT, rendered.WIDTH))
 
@@ -230,7 +232,7 @@ def test_haar_features_are_those_of_scikit_image() -> None:
 
 
 def test_a_detector_finds_walkers_of_another_scene() -> None:
-    """Precision .9 and recall .8 were measured at .9; trained on what is above the walkers it finds next to none."""
+    """Measured: precision .9, recall .8; trained on what is above the walkers it finds next to none."""
     pytest.importorskip("skimage", reason="needs the extra [vision]")
     pytest.importorskip("sklearn", reason="needs the extra [vision]")
     train, test = rendered.walkers(0), rendered.walkers(1)
@@ -241,7 +243,9 @@ def test_a_detector_finds_walkers_of_another_scene() -> None:
     truth = [test.boxes[k] for k in shown]
     score = precision_recall([found.detect(test.frames[k], 0.9) for k in shown], truth)
     assert score.precision > 0.6 and score.recall > 0.5
-    wrong = train_detector(frames, [rows - [0, 45, 0, 0, 0] for rows in boxes], **(options | {"mining": 0}))
+    wrong = train_detector(
+        frames, [rows - [0, 45, 0, 0, 0] for rows in boxes], **(options | {"mining": 0})
+    )
     other = precision_recall([wrong.detect(test.frames[k], 0.9) for k in shown], truth)
     assert not other.recall > 0.3
 

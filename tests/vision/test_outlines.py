@@ -96,7 +96,9 @@ def test_contours_that_are_none_are_refused() -> None:
 
 def test_a_known_recursion_is_learned() -> None:
     rng = np.random.default_rng(1)
-    true = SecondOrder([5.0, -2.0], [[1.6, 0.1], [0.0, 1.5]], [[-0.8, 0.0], [0.05, -0.7]], np.diag([0.5, 1.0]))
+    true = SecondOrder(
+        [5.0, -2.0], [[1.6, 0.1], [0.0, 1.5]], [[-0.8, 0.0], [0.05, -0.7]], np.diag([0.5, 1.0])
+    )
     x = np.zeros((4000, 2))
     for t in range(2, len(x)):
         x[t] = true.given(x[t - 1], x[t - 2]).sample(rng)
@@ -126,12 +128,14 @@ def test_one_normal_counts_as_isard_and_blake_say() -> None:
     frame[:, 31:] = 50.0  # an edge at x = 30.5
     line = Contour([[0.0, 2.0], [0.0, 8.0], [0.0, 12.0], [0.0, 18.0]], closed=False)
     edges = ContourEdges(
-        ShapeSpace(line, "translation"), frame.shape, sigma=3.0, reach=12.0, lines=1, missed=0.2, clutter=0.05,
-        tempering=1.0,
+        ShapeSpace(line, "translation"), frame.shape, sigma=3.0, reach=12.0, lines=1, missed=0.2,
+        clutter=0.05, tempering=1.0,
     )  # fmt: skip
     at = np.array([22.0, 27.0, 30.0, 36.0])
     found = edges.given(np.stack([at, np.zeros(4)], axis=-1)).log_prob(frame)
-    near = np.exp(-0.5 * ((np.array([30.0, 31.0])[:, None] - at) / 3) ** 2) / (3 * np.sqrt(2 * np.pi))
+    near = np.exp(-0.5 * ((np.array([30.0, 31.0])[:, None] - at) / 3) ** 2) / (
+        3 * np.sqrt(2 * np.pi)
+    )
     both = np.sort(np.log(0.2 + 0.8 / 0.05 * near), axis=0)  # the feature is one of two pixels
     assert ((both[0] - 1e-4 <= found) & (found <= both[1] + 1e-4)).all()
 
@@ -151,7 +155,9 @@ def test_a_contour_off_the_frame_is_missed_and_nothing_is_lost() -> None:
     edges = ContourEdges(ShapeSpace(CIRCLE, "translation"), (60, 80))
     log = edges.given([[0.0, 0.0], [60.0, 0.0], [1e6, -1e6]]).log_prob(disc())
     assert log[0] > 0 > log[1] and np.isfinite(log).all()
-    np.testing.assert_allclose(log[2], edges.tempering * edges.lines * np.log(edges.missed), rtol=1e-5)
+    np.testing.assert_allclose(
+        log[2], edges.tempering * edges.lines * np.log(edges.missed), rtol=1e-5
+    )
     dbn = bmc.DynamicBayesNet()
     dbn.add("shape", lambda shape_prev: bmc.MvNormal(shape_prev, scale_diag=[5.0, 5.0]),
             initial=bmc.MvNormal([0.0, 0.0], scale_diag=[1.0, 1.0]))  # fmt: skip
@@ -169,12 +175,18 @@ def test_frames_stand_in_plates_and_in_blocks() -> None:
     frames = np.stack([disc(), disc(45.0)])
     both = edges.given(states).log_prob(frames)
     for k in (0, 1):
-        np.testing.assert_allclose(both[:, k], edges.given(states[:, k]).log_prob(frames[k]), rtol=1e-5)
+        np.testing.assert_allclose(
+            both[:, k], edges.given(states[:, k]).log_prob(frames[k]), rtol=1e-5
+        )
 
 
 def test_edges_that_make_no_sense_are_refused() -> None:
     space = ShapeSpace(CIRCLE)
-    for options, said in (({"missed": 0.0}, "missed"), ({"sigma": -1.0}, "sigma"), ({"lines": 0}, "lines")):
+    for options, said in (
+        ({"missed": 0.0}, "missed"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"lines": 0}, "lines"),
+    ):
         with pytest.raises(ParameterError, match=said):
             ContourEdges(space, (60, 80), **options)
     with pytest.raises(ShapeError, match="frame_shape"):
@@ -201,5 +213,7 @@ def test_a_drawn_outline_is_followed_within_two_pixels(kind: str) -> None:
 def test_the_kalman_filter_goes_off_with_the_decoy() -> None:
     """Particles that are not lost there take long: ``python -m benchmarks.bench_vision decoy``."""
     scene = rendered.with_decoy()
-    off = np.hypot(*(scene.space.center(talking_head.kalman(scene)) - scene.space.center(scene.states)).T)
+    off = np.hypot(
+        *(scene.space.center(talking_head.kalman(scene)) - scene.space.center(scene.states)).T
+    )
     assert off[:20].max() < 2.0 and off[-5:].min() > 30.0
