@@ -1,9 +1,9 @@
 """How well things are followed in pictures, with the goals of each figure: one line per figure.
 
 ``python -m benchmarks.bench_vision [NAME ...]``; the names are ``head``, ``silhouette``, ``decoy``,
-``detector``, ``boosted`` and ``pedestrians``, all of them by default. The clips are those of the reference data
-(``BAYESMC_DATA``, else ``../shared/data``); what is not there is left out, and named. MOTA and IDF1 are those of
-motmetrics, in the peers' environment (``make peers``; ``BAYESMC_PEERS`` names another).
+``detector``, ``boosted`` and ``pedestrians``, all of them by default. The clips are those of the reference
+data (``BAYESMC_DATA``, else ``../shared/data``); what is not there is left out, and named. MOTA and IDF1 are
+those of motmetrics, in the peers' environment (``make peers``; ``BAYESMC_PEERS`` names another).
 """
 
 from __future__ import annotations
