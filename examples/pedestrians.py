@@ -88,14 +88,18 @@ class Tracker:
         For each element.
     guided : bool
         Whether particles are drawn from detections, too.
+    speed : float
+        Of newcomers along the picture, as a share of their height in a frame.
     """
 
-    def __init__(self, clip: Clip, particles: int = PARTICLES, guided: bool = True) -> None:
+    def __init__(
+        self, clip: Clip, particles: int = PARTICLES, guided: bool = True, speed: float = 0.03
+    ) -> None:
         self.motion, self.reads = BoxMotion(), BoxDetections(clip.frame_shape)
         height, width = clip.frame_shape
         seen = clip.detections[clip.detections[..., 2] > 0]
         sizes = np.log(seen[:, 2:4]).mean(axis=0) if len(seen) else np.log([width / 10, height / 4])
-        speed = 0.05 * np.exp(sizes[1])
+        speed = speed * np.exp(sizes[1])
         self.start = bmc.MvNormal(
             [width / 2, height / 2, *sizes, 0.0, 0.0],
             scale_diag=[width / 2, height / 2, 0.4, 0.4, speed, speed / 5],

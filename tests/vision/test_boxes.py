@@ -171,7 +171,7 @@ def test_several_come_and_go_and_boosted_proposals_are_ahead_at_equal_particles(
     clip = synthetic()
     scores = {}
     for guided in (True, False):
-        found = pedestrians.Tracker(clip, 300, guided).follow(clip.detections, 0)
+        found = pedestrians.Tracker(clip, 300, guided, speed=0.05).follow(clip.detections, 0)
         scores[guided] = precision_recall(found, clip.truth)
     assert scores[True].recall > 0.75 and scores[True].precision > 0.75
     assert scores[True].recall > scores[False].recall + 0.2
