@@ -174,6 +174,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """What not every program needs loads when first asked for."""
-    if name in ("io", "markov", "montecarlo", "plotting", "robotics", "testing"):
+    if name in ("io", "markov", "montecarlo", "plotting", "robotics", "testing", "vision"):
         return importlib.import_module(f"bayesmc.{name}")
     raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")

@@ -35,6 +35,7 @@ from examples import (
     nile,
     old_faithful,
     parzen,
+    pedestrians,
     picture,
     probit_regression,
     pushforward,
@@ -43,6 +44,7 @@ from examples import (
     rejection_and_importance,
     sonar_localization,
     stochastic_volatility,
+    talking_head,
     three_views,
     trueskill,
     van_der_merwe,
@@ -59,7 +61,7 @@ FIGURES = (
     laser_localization, sonar_localization, kidnapped_robot, landmark_localization, range_only,
     coupled_chains, radar_target, bee_dance, gnp_trend_cycle, variational_mixture,
     fading_channel,
-    colour_map,
+    colour_map, talking_head, pedestrians,
 )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "bayesmc"
 # Top to bottom. A package counts as one room; rooms on one line do not import each other.
 LAYERS = """
 __main__
-robotics | plotting | io | testing
+robotics | vision | plotting | io | testing
 auto
 pmcmc
 engines
@@ -55,7 +55,8 @@ LONG_FUNCTIONS: set[str] = set()
 TYPE_CIRCLES: set[str] = set()
 
 HEAVY = ("scipy.stats", "networkx", "arviz_stats", "arviz_base", "matplotlib", "hypothesis",
-         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas", "h5py", "h5netcdf")  # fmt: skip
+         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas", "h5py", "h5netcdf",
+         "skimage", "sklearn")  # fmt: skip
 
 
 def violations(sources: dict[str, str]) -> list[str]:
