@@ -10,12 +10,16 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked
 from bayesmc.engines.marginal.choices import MOST
+from bayesmc.engines.marginal.elements.filter import ElementStep
+from bayesmc.engines.marginal.elements.guides import why_not_guided
+from bayesmc.engines.marginal.elements.plan import ElementPlan, element_plan
 from bayesmc.engines.marginal.smoothing import why_not_backwards
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.marginal.tables.step import refuse_seen_in_part
 from bayesmc.engines.marginal.tables.telling import tables_told
 from bayesmc.engines.particles.layers import endless
-from bayesmc.engines.slice_steps import SliceProposals, plates_apart
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
 _SEEN = "observed, weights the particles by its predictive density"
@@ -27,6 +31,60 @@ FEW = 8.0
 PAST = ("smooth", "fixed-lag")
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
+
+
+def marginal_step(
+    engine: Any,
+    split: Split,
+    slices: Slices,
+    static: Mapping[str, np.ndarray],
+    scheme: Any,
+    threshold: float,
+    kept: Any,
+    asked: SliceProposals | None,
+) -> MarginalStep:
+    """The step of a filter that integrates out: by element where elements are proven independent."""
+    plan = SlicePlan(slices, plates_apart(slices), static)
+    given = plan, split, engine.particles, scheme, threshold, kept, asked
+    elements = elements_of(slices, split, asked)
+    if elements is None:
+        return MarginalStep(*given)
+    guided: tuple[str, ...] = ()
+    if asked is None:
+        found = guided_nodes(slices, split, elements)
+        if found is None:
+            return MarginalStep(*given)
+        guided = found
+    return ElementStep(*given, elements, guided)
+
+
+def elements_of(
+    slices: Slices, split: Split, asked: SliceProposals | None
+) -> ElementPlan | None:
+    """What is integrated out element by element, where that pays; else None."""
+    if not split.inner:
+        return None
+    proposed = () if asked is None else [n for p in (*asked.first, *asked.later) for n in p.names]
+    key = (split, tuple(proposed))
+    kept = slices.later.cache.setdefault("elements", {})
+    if key not in kept:
+        found = element_plan(
+            slices, split.inner, split.seen, split.linearised, plates_apart(slices), proposed
+        )
+        pays = found is not None and (found.is_picked or found.still or bool(split.linearised))
+        kept[key] = found if pays else None
+    return kept[key]
+
+
+def guided_nodes(slices: Slices, split: Split, elements: ElementPlan) -> tuple[str, ...] | None:
+    """Sampled numbers that are drawn with a look at what is read of elements; None where that cannot be."""
+    free = [n for n in slices.stochastic if n not in split.seen and n not in split.waiting]
+    free = [n for n in free if n not in elements.pickers]
+    if not free:
+        return ()
+    if len(free) > 1 or why_not_guided(slices, elements, free[0]) is not None:
+        return None
+    return (free[0],)
 
 
 def read_marginalize(engine: Any) -> Any:

@@ -56,6 +56,8 @@ class FilterStep(SMCStep):
     integrated: frozenset[str] = frozenset()
     #: how many slices back answers are wanted
     lag: int = 0
+    #: whether beliefs must be about all of a slice together, as what goes back over slices takes them
+    whole: bool = False
 
     def __init__(
         self,
