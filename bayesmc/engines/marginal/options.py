@@ -58,9 +58,7 @@ def marginal_step(
     return ElementStep(*given, elements, guided)
 
 
-def elements_of(
-    slices: Slices, split: Split, asked: SliceProposals | None
-) -> ElementPlan | None:
+def elements_of(slices: Slices, split: Split, asked: SliceProposals | None) -> ElementPlan | None:
     """What is integrated out element by element, where that pays; else None."""
     if not split.inner:
         return None

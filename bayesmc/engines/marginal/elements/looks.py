@@ -106,7 +106,9 @@ class PickedLook:
         self.at = at
         self._ways: dict[Expression, Way] = {}
         self._result = mapped(read.result, lambda e: self._apart(model, e, sources))
-        self._mean = broadcast(self._apart(model, mean(read.result), sources), self.node.value_shape)
+        self._mean = broadcast(
+            self._apart(model, mean(read.result), sources), self.node.value_shape
+        )
         self.ways = tuple(self._ways.values())
         self.count, self.width = self._arranged()
         roots = [*expressions_of(self._result), self._mean, at, *self._found()]
@@ -166,7 +168,9 @@ class PickedLook:
         shape = (batch, *node.value_shape)
         result = made_of(self._result, iter(parameters))
         if result.invalid is not None:
-            error = invalid_error(node, result, np.ones((batch,), dtype=bool), (batch,), noiseless=True)
+            error = invalid_error(
+                node, result, np.ones((batch,), dtype=bool), (batch,), noiseless=True
+            )
             if error is not None:
                 raise error
         mean = np.broadcast_to(mean, shape).reshape(batch, self.count, self.width)
@@ -243,7 +247,9 @@ class PickedLook:
         return [e for w in self._ways.values() for e in (w.element, w.component)]
 
     def _tangent(self, shapes: Mapping[str, tuple[int, ...]]) -> Program:
-        return Program([tangent(self._mean, {n: leaf(f"move of {n}", s) for n, s in shapes.items()})])
+        return Program(
+            [tangent(self._mean, {n: leaf(f"move of {n}", s) for n, s in shapes.items()})]
+        )
 
     def _by_number(self, found: np.ndarray, count: int, batch: int) -> np.ndarray:
         full = np.broadcast_to(found, (count, batch, *self.node.value_shape))
@@ -285,7 +291,9 @@ class PickedLook:
         plates = self.node.plate_shape
         own = np.arange(math.prod(plates)).reshape(plates)
         ahead = shape[: len(plates)]
-        if len(ahead) < len(plates) or any(a not in (1, p) for a, p in zip(ahead, plates, strict=True)):
+        if len(ahead) < len(plates) or any(
+            a not in (1, p) for a, p in zip(ahead, plates, strict=True)
+        ):
             return np.zeros(math.prod(shape), dtype=np.intp)
         some = own[tuple(slice(0, a) for a in ahead)]
         wide = some.reshape((*ahead, *(1,) * (len(shape) - len(ahead))))

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Slices
+from bayesmc.distributions import MvNormal, Normal
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.marginal.elements.looks import PickedLook
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression
+from bayesmc.expression import Constant, Expression, Family, Leaf
+from bayesmc.network.expressions import Opaque, density
 from bayesmc.network.model import Model
 from bayesmc.structure.picked import picked_element
 
@@ -176,7 +178,10 @@ def _is_own(group: Group, look: PickedLook) -> bool:
 
 def _ranges(slices: Slices, states: tuple[str, ...]) -> dict[str, slice]:
     """Where numbers of nodes stand among those of an element, as layouts have them."""
-    order = (*(n for n in slices.interface if n in states), *(n for n in states if n not in slices.interface))
+    order = (
+        *(n for n in slices.interface if n in states),
+        *(n for n in states if n not in slices.interface),
+    )
     found, low = {}, 0
     for name in order:
         size = math.prod(slices.first[name].event_shape)
@@ -316,6 +321,23 @@ def _below(slices: Slices, groups: list[tuple[Group, ...]]) -> frozenset[str]:
 
 
 def _is_still(layout: Layout, states: tuple[str, ...]) -> bool:
-    """Whether a later slice's elements are surely those of the slice before."""
-    own = {n + PREVIOUS for n in states}
-    return all(set(layout.model[n].parents) <= own for n in states)
+    """Whether a later slice's elements are those of the slice before, as their functions say it."""
+    return all(_is_carried_on(layout.model, name) for name in states)
+
+
+def _is_carried_on(model: Model, name: str) -> bool:
+    """Whether a node is normal about its own value before, without noise."""
+    read = density(model, name)
+    if isinstance(read, Opaque) or not isinstance(read.result, Family):
+        return False
+    if read.result.make not in (Normal, MvNormal):
+        return False
+    parameters = dict(read.result.parameters)
+    loc = parameters.pop("loc", None)
+    if not isinstance(loc, Leaf) or loc.name != name + PREVIOUS:
+        return False
+    scales = [v.value if isinstance(v, Constant) else v for v in parameters.values()]
+    scales = [v for v in scales if v is not None]
+    if not scales or any(isinstance(v, Expression) for v in scales):
+        return False
+    return not any(np.any(v) for v in scales)

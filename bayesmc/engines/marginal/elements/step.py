@@ -123,7 +123,9 @@ class ElementFilter:
         log = log + made.log[:, 0].reshape(n, *self.weights, -1).sum(axis=-1)
         agreed = before is None and not reader.leaves & known.own
         mean = after.mean[:1] if agreed else after.mean
-        root = after.factors[after.which[:1]] if agreed and after.which is not None else after.roots()
+        root = (
+            after.factors[after.which[:1]] if agreed and after.which is not None else after.roots()
+        )
         if agreed:
             root = root[:1]
         return log, Pool.of(self._flat(mean, 1), self._flat(root, 2), self.group, n)
@@ -177,7 +179,9 @@ class ElementFilter:
             if seen is None:
                 continue
             if seen.mask is None:
-                found[name] = Observed(seen.value, np.ones(self.slices.first[name].plate_shape, bool))
+                found[name] = Observed(
+                    seen.value, np.ones(self.slices.first[name].plate_shape, bool)
+                )
             elif seen.mask.any() or (seen.parts is not None and seen.parts.any()):
                 found[name] = seen
         return found
@@ -196,7 +200,9 @@ class ElementFilter:
             which, reading = np.repeat(np.arange(n), len(readings)), np.tile(readings, n)
             every = len(which)
 
-            def tangent(points: np.ndarray, some: np.ndarray, own: Any = (which, reading, every, none)) -> Tangent:
+            def tangent(
+                points: np.ndarray, some: np.ndarray, own: Any = (which, reading, every, none)
+            ) -> Tangent:
                 which, reading, every, none = own
                 if len(some) == every:
                     grid = np.zeros((n, group.count, points.shape[-1]))
@@ -212,7 +218,9 @@ class ElementFilter:
             made = linearised(prior, rows, tangent, group.bent)
             after, own = conditioned(prior, rows, made)
             pool = put(after)
-            np.add.at(log, (which, np.broadcast_to(self.group[at], (n, len(readings))).reshape(-1)), own)
+            np.add.at(
+                log, (which, np.broadcast_to(self.group[at], (n, len(readings))).reshape(-1)), own
+            )
         del total
         return log.reshape(n, *self.weights), pool
 
@@ -232,7 +240,9 @@ class ElementFilter:
         n, states = known.particles, node.domain.size
         prior_log = self._log_prior(row, group.picker, known)
         codes = np.arange(states).astype(node.domain.dtype)
-        codes = np.broadcast_to(codes.reshape(-1, *(1,) * len(node.plates)), (states, *node.plate_shape))
+        codes = np.broadcast_to(
+            codes.reshape(-1, *(1,) * len(node.plates)), (states, *node.plate_shape)
+        )
         looking = Looking(group, known.repeated(states, {group.picker: codes}))
         places = np.broadcast_to(looking.at, (n * states, group.count)).reshape(n, states, -1)
         picks = np.zeros((n, group.count), dtype=node.domain.dtype)
@@ -247,7 +257,9 @@ class ElementFilter:
             if data.present[r].any():
                 some = Belief(prior.mean[possible], prior.root[possible])
 
-                def tangent(points: np.ndarray, which: np.ndarray, of: Any = (possible, r)) -> Tangent:
+                def tangent(
+                    points: np.ndarray, which: np.ndarray, of: Any = (possible, r)
+                ) -> Tangent:
                     chosen = of[0][which]
                     found = looking.some(chosen, np.full(len(which), of[1]), points)
                     found.slopes[looking_none(places, chosen, of[1])] = 0.0

@@ -27,7 +27,7 @@ from bayesmc.engines.kalman.means import absorbed
 from bayesmc.linalg.square_root import condition_many
 
 #: standard deviations of the noise that a tangent may miss a reading by at the updated mean
-_MISSED = 0.5
+_MISSED = 3.0
 #: steps of Gauss and Newton, halvings of each, and the length, in standard deviations, of a step that is none
 _STEPS, _HALVINGS, _SETTLED = 30, 8, 1e-3
 
@@ -207,7 +207,9 @@ def _mode(prior: Belief, row: Row, at: At) -> np.ndarray:
             better = own <= cost[going[left]]
             to = going[left[better]]
             best[to], cost[to] = z[better], own[better]
-            gone[left[better]] = np.linalg.norm(length[left[better], None] * move[left[better]], axis=-1)
+            gone[left[better]] = np.linalg.norm(
+                length[left[better], None] * move[left[better]], axis=-1
+            )
             for whole, part in zip(tangent, made, strict=True):
                 whole[to] = part[better]
             left = left[~better]
@@ -215,6 +217,8 @@ def _mode(prior: Belief, row: Row, at: At) -> np.ndarray:
             if not len(left):
                 break
         scaled = np.linalg.solve(tangent.noise[going], tangent.slopes[going] @ prior.root[going])
-        spread = 1.0 + np.sqrt(np.square(scaled).sum(axis=(-2, -1)))  # steps in posterior deviations
+        spread = 1.0 + np.sqrt(
+            np.square(scaled).sum(axis=(-2, -1))
+        )  # steps in posterior deviations
         going = going[gone * spread > _SETTLED]
     return prior.mean + np.matvec(prior.root, best)
