@@ -49,12 +49,11 @@ def marginal_step(
     elements = elements_of(slices, split, asked)
     if elements is None:
         return MarginalStep(*given)
-    guided: tuple[str, ...] = ()
+    guided = None
     if asked is None:
-        found = guided_nodes(slices, split, elements)
-        if found is None:
+        guided, is_wrong = guided_node(slices, split, elements)
+        if is_wrong:
             return MarginalStep(*given)
-        guided = found
     return ElementStep(*given, elements, guided)
 
 
@@ -74,15 +73,17 @@ def elements_of(slices: Slices, split: Split, asked: SliceProposals | None) -> E
     return kept[key]
 
 
-def guided_nodes(slices: Slices, split: Split, elements: ElementPlan) -> tuple[str, ...] | None:
-    """Sampled numbers that are drawn with a look at what is read of elements; None where that cannot be."""
+def guided_node(slices: Slices, split: Split, elements: ElementPlan) -> tuple[str | None, bool]:
+    """The sampled vector that is drawn with a look at readings of elements, and whether that cannot be.
+
+    Finite nodes that pick are drawn so anyhow; others are not, by element.
+    """
     free = [n for n in slices.stochastic if n not in split.seen and n not in split.waiting]
     free = [n for n in free if n not in elements.pickers]
-    if not free:
-        return ()
-    if len(free) > 1 or why_not_guided(slices, elements, free[0]) is not None:
-        return None
-    return (free[0],)
+    if any(slices.later[n].domain is not None for n in free):
+        return None, True
+    fits = [n for n in free if why_not_guided(slices, elements, n) is None]
+    return (fits[0], False) if len(fits) == 1 else (None, bool(free))
 
 
 def read_marginalize(engine: Any) -> Any:
@@ -175,6 +176,9 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     slices = problem.slices
     sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.waiting]
     if engine.proposal == "optimal":
+        elements = elements_of(slices, split, None)
+        if elements is not None and not guided_node(slices, split, elements)[1]:
+            return None
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:
             return (

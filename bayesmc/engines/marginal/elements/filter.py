@@ -28,8 +28,8 @@ class ElementStep(MarginalStep):
     Parameters
     ----------
     elements : ElementPlan
-    guided : tuple of str
-        Sampled nodes that are drawn with a look at what is read of elements.
+    guided : str, optional
+        A sampled node that is drawn with a look at what is read of elements.
 
     The others are those of ``MarginalStep``, which answers about slices that lie back.
     """
@@ -44,12 +44,12 @@ class ElementStep(MarginalStep):
         kept: Sequence[str] | None,
         proposals: SliceProposals | None,
         elements: ElementPlan,
-        guided: tuple[str, ...] = (),
+        guided: str | None = None,
     ) -> None:
         super().__init__(plan, split, particles, resample, threshold, kept, proposals)
         self.plan_of_elements = elements
         self.elements = ElementFilter(plan.slices, elements, plan.apart)
-        self.guide = Guide(plan, elements, self.elements, guided) if guided else None
+        self.guide = Guide(plan.slices, self.elements, guided) if guided else None
         self._late: dict[Any, tuple[list[Step], frozenset[str]]] = {}
 
     @property

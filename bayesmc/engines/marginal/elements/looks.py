@@ -197,6 +197,17 @@ class PickedLook:
         (found,) = self._slopes[None](values | self._leaves(entries, x) | moves)
         return self._by_number(found, n, len(x))
 
+    def prepare(self, name: str) -> None:
+        """Make ready how means move with a node that is known.
+
+        Raises
+        ------
+        TraceError
+        """
+        if name not in self._slopes:
+            roots = [n for n in ordered(self._mean) if isinstance(n, Leaf) and n.name == name]
+            self._slopes[name] = self._tangent({n.name: n.shape for n in roots})
+
     def slopes_along(
         self,
         name: str,
@@ -210,10 +221,7 @@ class PickedLook:
         ------
         TraceError
         """
-        if name not in self._slopes:
-            roots = [n for n in ordered(self._mean) if isinstance(n, Leaf) and n.name == name]
-            shapes = {n.name: n.shape for n in roots}
-            self._slopes[name] = self._tangent(shapes)
+        self.prepare(name)
         value = values[name]
         size = math.prod(value.shape[1:])
         unit = np.eye(size).reshape(size, 1, *value.shape[1:])

@@ -290,7 +290,7 @@ def _picks_alone(
         return False
     if any(look.node.plates != reading.plates for look in group.looks):
         return False
-    below = _descendants(slices, model, {name})
+    below = descendants(slices, model, {name})
     for other in slices.dynamic:
         if other in below and model[other].is_stochastic and other not in group.names:
             return False
@@ -301,7 +301,7 @@ def _picks_alone(
     return all(np.array_equal(np.ravel(getattr(at, "value", -1)), every) for at in own)
 
 
-def _descendants(slices: Slices, model: Model, names: Collection[str]) -> set[str]:
+def descendants(slices: Slices, model: Model, names: Collection[str]) -> set[str]:
     """Nodes of the slice that depend on some."""
     found = set(names)
     for name in model.nodes:
@@ -315,7 +315,7 @@ def _below(slices: Slices, groups: list[tuple[Group, ...]]) -> frozenset[str]:
     found: set[str] = set()
     for model, own in zip((slices.first, slices.later), groups, strict=True):
         pickers = {g.picker for g in own if g.picker is not None}
-        below = _descendants(slices, model, pickers)
+        below = descendants(slices, model, pickers)
         found |= {n for n in below if not model[n].is_stochastic}
     return frozenset(found)
 

@@ -13,6 +13,7 @@ Probabilistic Robotics, sec. 13.3 and 13.6 (data association by particle).
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -82,14 +83,14 @@ class ElementFilter:
             if group.picker is not None and not _is_seen(row.seen.get(group.picker)):
                 more, pool, picks = self._picked(row, group, data, known, pool, rng)
                 drawn[group.picker] = picks
-                known = _with(known, {group.picker: picks})
+                known = with_more(known, {group.picker: picks})
             elif len(data.some):
                 more, pool = self._updated(group, data, known, pool)
             else:
                 continue
             log = log + more
         below = self._computed(row, known)
-        known = _with(known, below)
+        known = with_more(known, below)
         layout = self.layouts[min(row.t, 1)]
         found = ElementBeliefs(layout, pool, missing=self._missing(row, known, pool))
         return log, found, drawn | below
@@ -129,6 +130,24 @@ class ElementFilter:
         if agreed:
             root = root[:1]
         return log, Pool.of(self._flat(mean, 1), self._flat(root, 2), self.group, n)
+
+    def repeated(self, name: str, known: Known, row: Row) -> Known:
+        """Every particle with every state of a finite node."""
+        node = self.slices.model(row.t)[name]
+        assert node.domain is not None
+        codes = np.arange(node.domain.size).astype(node.domain.dtype)
+        codes = codes.reshape((-1, *(1,) * len(node.plates)))
+        wide = np.broadcast_to(codes, (node.domain.size, *node.plate_shape))
+        return known.repeated(node.domain.size, {name: wide})
+
+    def of_batch(self, pool: Pool, at: np.ndarray, batch: int) -> tuple[np.ndarray, np.ndarray]:
+        """Beliefs about elements of several copies of each particle, shape (batch, readings, ...)."""
+        each = batch // pool.particles
+        at = np.broadcast_to(at, (batch, at.shape[1]))
+        prior, _ = gathered(pool, at.reshape(pool.particles, -1), pool.particles)
+        shape = (pool.particles * each, at.shape[1])
+        n = prior.mean.shape[-1]
+        return prior.mean.reshape(*shape, n), prior.root.reshape(*shape, n, n)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -191,7 +210,7 @@ class ElementFilter:
     ) -> tuple[np.ndarray, Pool]:
         """Elements that are read, in rounds in which no particle reads one of them twice."""
         looking = Looking(group, known)
-        n, total = known.particles, np.zeros((known.particles, len(pool.home)))
+        n = known.particles
         log = np.zeros((n, math.prod(self.weights)))
         for readings in _rounds(looking.at, data.some):
             at = np.where(looking.at < 0, 0, self.order[looking.at])[:, readings]
@@ -221,7 +240,6 @@ class ElementFilter:
             np.add.at(
                 log, (which, np.broadcast_to(self.group[at], (n, len(readings))).reshape(-1)), own
             )
-        del total
         return log.reshape(n, *self.weights), pool
 
     def _picked(
@@ -235,15 +253,11 @@ class ElementFilter:
     ) -> tuple[np.ndarray, Pool, np.ndarray]:
         """Picks drawn given the readings, one after the other, and elements updated by them."""
         assert group.picker is not None
-        model, node = self.slices.model(row.t), self.slices.model(row.t)[group.picker]
+        node = self.slices.model(row.t)[group.picker]
         assert node.domain is not None
         n, states = known.particles, node.domain.size
-        prior_log = self._log_prior(row, group.picker, known)
-        codes = np.arange(states).astype(node.domain.dtype)
-        codes = np.broadcast_to(
-            codes.reshape(-1, *(1,) * len(node.plates)), (states, *node.plate_shape)
-        )
-        looking = Looking(group, known.repeated(states, {group.picker: codes}))
+        prior_log = self.log_prior(row, group.picker, known)
+        looking = Looking(group, self.repeated(group.picker, known, row))
         places = np.broadcast_to(looking.at, (n * states, group.count)).reshape(n, states, -1)
         picks = np.zeros((n, group.count), dtype=node.domain.dtype)
         log = np.zeros((n, math.prod(self.weights)))
@@ -252,7 +266,7 @@ class ElementFilter:
             own = prior_log[..., r]
             possible = np.flatnonzero(own.reshape(-1) > -np.inf)
             rows = data.of(np.full(len(possible), r))
-            prior, put = gathered(pool, at, n)
+            prior, _ = gathered(pool, at, n)
             joint, made = np.array(own), None
             if data.present[r].any():
                 some = Belief(prior.mean[possible], prior.root[possible])
@@ -288,10 +302,9 @@ class ElementFilter:
                 pool = gathered(pool, at[np.arange(n), chosen][:, None], n)[1](after)
         value = picks.reshape(n, *node.plate_shape)
         value.flags.writeable = False
-        del model, put
         return log.reshape(n, *self.weights), pool, value
 
-    def _log_prior(self, row: Row, name: str, known: Known) -> np.ndarray:
+    def log_prior(self, row: Row, name: str, known: Known) -> np.ndarray:
         """Log probabilities of a finite node's states, shape (particles, states, elements)."""
         model = self.slices.model(row.t)
         node = model[name]
@@ -428,5 +441,6 @@ def _is_seen(seen: Observed | None) -> bool:
     return seen is not None and seen.mask is None
 
 
-def _with(known: Known, more: dict[str, np.ndarray]) -> Known:
+def with_more(known: Known, more: Mapping[str, np.ndarray]) -> Known:
+    """What is known, with more values of each particle."""
     return Known({**known.values, **more}, known.own | more.keys(), known.particles)
