@@ -258,8 +258,9 @@ def alike(one: Particles, other: Particles) -> bool:
     """Whether two slices can stand side by side: laid out alike, and none drawn anew."""
     if len(one.weights) != len(other.weights) or one.rejuvenated is not False:
         return False
-    for name, own in one.values.items():
-        if own.ndim != other.values[name].ndim:
+    theirs = dict(dict.items(other.values))  # without what is drawn once it is looked at
+    for name, own in dict.items(one.values):
+        if name in theirs and own.ndim != theirs[name].ndim:
             return False
     return other.rejuvenated is False
 

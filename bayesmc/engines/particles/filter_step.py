@@ -58,6 +58,8 @@ class FilterStep(SMCStep):
     lag: int = 0
     #: whether beliefs must be about all of a slice together, as what goes back over slices takes them
     whole: bool = False
+    #: whether rows are held against some that are drawn: not where that costs more than all the rest
+    compares_rows: bool = True
 
     def __init__(
         self,

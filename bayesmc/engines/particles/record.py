@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from bayesmc.engines.filtering import (
     pass_slices,
     refuse_forecast,
 )
+from bayesmc.engines.particles.agreed import answers_of, some_numbers
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
@@ -29,7 +31,7 @@ from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written
 from bayesmc.errors import QueryError
-from bayesmc.network import Model
+from bayesmc.network import CompiledNode, Model
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
@@ -169,6 +171,13 @@ class Record:
         rows: Rows = {what: {} for what in KINDS}
         for node in self._nodes:
             name = node.name
+            some = some_numbers(slices, node)
+            if some is not None:
+                found = answers_of(block, by, node, some)
+                for what, own in zip(("means", "variances", "errors"), found, strict=True):
+                    if by is not None or what != "errors":
+                        rows[what][name] = own
+                continue
             if node.domain is not None:
                 rows["tables"][name] = block.table(node)
             else:
@@ -247,7 +256,7 @@ class Record:
 
     def _together(self, particles: Particles) -> int:
         """Slices that are written together."""
-        numbers = sum(particles.values[n.name].size for n in self._nodes)
+        numbers = sum(_numbers(particles, n) for n in self._nodes)
         many = NUMBERS // max(numbers, len(particles.weights))
         return min(TOGETHER, max(1, many // 2, min(FEW, many)))
 
@@ -403,7 +412,8 @@ def filtered_by(
     """
     record = Record(problem, step.layout, queries, keep, Tracker(step), names)
     rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    looks = Replicates(problem, step.plan, check) if unit == 0 else None
+    compared = unit == 0 and step.compares_rows
+    looks = Replicates(problem, step.plan, check) if compared else None
     now: Particles | None = None
     is_ahead = step.machine is not None and look_back is None
     ahead = Ahead(step.machine, problem, record) if is_ahead else None
@@ -448,3 +458,13 @@ def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
 def _packed(written: Sequence[Written]) -> Written:
     """Slices without their particles, as one."""
     return Written({what: _joined(written, what) for what in KINDS}, [], [])
+
+
+def _numbers(particles: Particles, node: CompiledNode) -> int:
+    """How many numbers are worked out of a node."""
+    held = dict.get(particles.values, node.name)  # without drawing what is drawn once it is looked at
+    if held is not None:
+        return int(held.size)
+    some = some_numbers([particles], node)
+    count = math.prod(node.value_shape) if some is None else len(some)
+    return count * len(particles.weights)

@@ -66,6 +66,9 @@ class ElementBeliefs(NamedTuple):
     def moments_of(self, node: CompiledNode) -> tuple[np.ndarray, np.ndarray]:
         if node.name in self.missing:
             return self.missing[node.name]
+        numbers = getattr(node, "numbers", None)
+        if numbers is not None:  # of some of them alone
+            return self.moments_at(node.node, numbers)  # type: ignore[attr-defined]
         mean, root = self.dense()
         place = self.layout.rows[node.name]
         rows = root[..., place, :]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,6 +21,10 @@ from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals
 from bayesmc.errors import UnsupportedError
 from bayesmc.network.forward import Step
+
+
+#: numbers of all elements up to which rows are held against some that are drawn: each draws all elements
+_COMPARED = 512
 
 
 class ElementStep(MarginalStep):
@@ -50,6 +55,8 @@ class ElementStep(MarginalStep):
         self.plan_of_elements = elements
         self.elements = ElementFilter(plan.slices, elements, plan.apart)
         self.guide = Guide(plan.slices, self.elements, guided) if guided else None
+        numbers = math.prod(self.elements.layouts[0].lead) * self.elements.layouts[0].n
+        self.compares_rows = numbers <= _COMPARED
         self._late: dict[Any, tuple[list[Step], frozenset[str]]] = {}
 
     @property
@@ -61,7 +68,10 @@ class ElementStep(MarginalStep):
         if not self.by_element:
             return super().__call__(earlier, row, rng)
         steps, late = self._steps(row)
-        before, selection = self.chosen(earlier, row, rng)
+        held = earlier
+        if earlier is not None:  # without drawing what nobody has looked at
+            held = earlier._replace(values=dict(dict.items(earlier.values)))
+        before, selection = self.chosen(held, row, rng)
         hidden = self.elements.hidden_before
         if self.tables is not None:
             hidden = hidden | self.tables.hidden_before
