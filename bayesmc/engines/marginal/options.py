@@ -73,6 +73,26 @@ def elements_of(slices: Slices, split: Split, asked: SliceProposals | None) -> E
     return kept[key]
 
 
+def elements_asked(engine: Any, slices: Slices, split: Split) -> ElementPlan | None:
+    """What this engine integrates out element by element, if anything."""
+    asked = None if engine.proposal == "optimal" else engine._proposals(slices)
+    elements = elements_of(slices, split, asked)
+    if elements is not None and asked is None and guided_node(slices, split, elements)[1]:
+        return None
+    return elements
+
+
+def drawn_by_element(
+    engine: Any, slices: Slices, split: Split, elements: ElementPlan, name: str, plain: str
+) -> str:
+    """What is done to a sampled node beside elements."""
+    if name in elements.pickers:
+        return "sampled given what it picks and the reading"
+    if engine.proposal == "optimal" and guided_node(slices, split, elements)[0] == name:
+        return "sampled given the slice before and the row, made linear in it"
+    return plain
+
+
 def guided_node(slices: Slices, split: Split, elements: ElementPlan) -> tuple[str | None, bool]:
     """The sampled vector that is drawn with a look at readings of elements, and whether that cannot be.
 
@@ -263,6 +283,11 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
         each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
+    elements = elements_asked(engine, slices, split)
+    if elements is not None:
+        lead = " and ".join(map(repr, elements.plates))
+        how = "where it is read" if elements.still else "all of which move"
+        each = f"a Kalman filter for each particle and element of {lead}, {how}"
     for name in slices.dynamic:
         if name in split.inner:
             found[name] = f"integrated out, {each}"
@@ -272,7 +297,9 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
             found[name] = _SEEN
         else:
             drawn = name in slices.stochastic and name not in problem.seen
-            if drawn and engine.proposal == "optimal":
+            if drawn and elements is not None:
+                found[name] = drawn_by_element(engine, slices, split, elements, name, found[name])
+            elif drawn and engine.proposal == "optimal":
                 found[name] = "sampled given the slice before and the row"
             if name in split.why:
                 found[name] += f"; not integrated out: {split.why[name]}"

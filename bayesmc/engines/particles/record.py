@@ -412,7 +412,7 @@ def filtered_by(
     """
     record = Record(problem, step.layout, queries, keep, Tracker(step), names)
     rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    compared = unit == 0 and step.compares_rows
+    compared = unit == 0 and not step.too_wide
     looks = Replicates(problem, step.plan, check) if compared else None
     now: Particles | None = None
     is_ahead = step.machine is not None and look_back is None

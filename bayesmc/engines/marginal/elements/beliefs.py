@@ -5,12 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.elements.pool import Pool
 from bayesmc.network import CompiledNode
+
+
+#: of layouts, by node: worked out once
+_TURNED: WeakKeyDictionary[Layout, dict[str, np.ndarray]] = WeakKeyDictionary()
 
 
 class ElementBeliefs(NamedTuple):
@@ -86,12 +91,9 @@ class ElementBeliefs(NamedTuple):
 
     def moments_at(self, node: CompiledNode, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and variances of some of a node's numbers, shape (particles, numbers)."""
-        places = self._places(node)
-        where = np.empty((places.size, 2), dtype=np.intp)
-        where[places.reshape(-1)] = np.stack(
-            np.meshgrid(*map(np.arange, places.shape), indexing="ij"), axis=-1
-        ).reshape(-1, 2)
-        element, component = where[numbers].T
+        width = self.layout.size(node.name)
+        turned = self._turned(node)[numbers]
+        element, component = turned // width, turned % width
         ids, back = np.unique(element, return_inverse=True)
         mean, root = self.pool.at(ids)
         component = component + self.layout.rows[node.name].start
@@ -136,6 +138,15 @@ class ElementBeliefs(NamedTuple):
         return found
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _turned(self, node: CompiledNode) -> np.ndarray:
+        """By flat place of a node's numbers, its place in the order of elements."""
+        kept = _TURNED.setdefault(self.layout, {})
+        if node.name not in kept:
+            places = self._places(node).reshape(-1)
+            kept[node.name] = np.empty(places.size, dtype=np.intp)
+            kept[node.name][places] = np.arange(places.size)
+        return kept[node.name]
 
     def _places(self, node: CompiledNode) -> np.ndarray:
         """Flat places of a node's numbers, by element and component."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,15 +17,15 @@ from bayesmc.engines.marginal.elements.step import ElementFilter
 from bayesmc.engines.marginal.split import Split
 from bayesmc.engines.marginal.step import MarginalStep, degenerate
 from bayesmc.engines.marginal.tables.afterwards import drawn_afterwards
-from bayesmc.engines.particles.filter_step import has_weight
+from bayesmc.engines.particles.filter_step import block_of, has_weight
 from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals
 from bayesmc.errors import UnsupportedError
 from bayesmc.network.forward import Step
 
 
-#: numbers of all elements up to which rows are held against some that are drawn: each draws all elements
-_COMPARED = 512
+#: numbers of all elements up to which all of them are drawn to follow how the filter does
+_DRAWN = 512
 
 
 class ElementStep(MarginalStep):
@@ -55,8 +56,12 @@ class ElementStep(MarginalStep):
         self.plan_of_elements = elements
         self.elements = ElementFilter(plan.slices, elements, plan.apart)
         self.guide = Guide(plan.slices, self.elements, guided) if guided else None
+        # states have no place in the blocks in which particles are passed
+        sizes = [math.prod(plan.slices.later[n].value_shape) for n in plan.slices.dynamic
+                 if n not in elements.states]  # fmt: skip
+        self.layout = replace(self.layout, block=block_of(particles, max(sizes, default=1)))
         numbers = math.prod(self.elements.layouts[0].lead) * self.elements.layouts[0].n
-        self.compares_rows = numbers <= _COMPARED
+        self.too_wide = frozenset(elements.states if numbers > _DRAWN else ())
         self._late: dict[Any, tuple[list[Step], frozenset[str]]] = {}
 
     @property

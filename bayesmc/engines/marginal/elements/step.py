@@ -105,7 +105,9 @@ class ElementFilter:
         if before is not None and not seen and self._stays(known):
             return log, before.pool
         reader = self.readers[min(row.t, 1)]
-        start = nothing(layout, n) if before is None else _dense(before)
+        agreed = before is None and not reader.leaves & known.own
+        copies = 1 if agreed else n
+        start = nothing(layout, copies) if before is None else _dense(before)
         given = given_values(layout, seen, ())
         empty = np.zeros((*layout.lead, layout.n), dtype=bool)
         pattern = pattern_of(layout, empty if given is None else given[1])
@@ -115,21 +117,16 @@ class ElementFilter:
         values = Values(
             {k: v for k, v in known.values.items() if k not in known.own},
             {k: known.values[k] for k in known.own & reader.needed},
-            n,
+            copies,
         )
         made = take_in(
             layout, pattern, start, reader.read(values), target, None if given is None else given[0]
         )
         after = made.chosen(None)
-        log = log + made.log[:, 0].reshape(n, *self.weights, -1).sum(axis=-1)
-        agreed = before is None and not reader.leaves & known.own
-        mean = after.mean[:1] if agreed else after.mean
-        root = (
-            after.factors[after.which[:1]] if agreed and after.which is not None else after.roots()
+        log = log + made.log[:, 0].reshape(copies, *self.weights, -1).sum(axis=-1)
+        return log, Pool.of(
+            self._flat(after.mean, 1), self._flat(after.roots(), 2), self.group, n
         )
-        if agreed:
-            root = root[:1]
-        return log, Pool.of(self._flat(mean, 1), self._flat(root, 2), self.group, n)
 
     def repeated(self, name: str, known: Known, row: Row) -> Known:
         """Every particle with every state of a finite node."""
@@ -142,12 +139,10 @@ class ElementFilter:
 
     def of_batch(self, pool: Pool, at: np.ndarray, batch: int) -> tuple[np.ndarray, np.ndarray]:
         """Beliefs about elements of several copies of each particle, shape (batch, readings, ...)."""
-        each = batch // pool.particles
         at = np.broadcast_to(at, (batch, at.shape[1]))
         prior, _ = gathered(pool, at.reshape(pool.particles, -1), pool.particles)
-        shape = (pool.particles * each, at.shape[1])
         n = prior.mean.shape[-1]
-        return prior.mean.reshape(*shape, n), prior.root.reshape(*shape, n, n)
+        return prior.mean.reshape(*at.shape, n), prior.root.reshape(*at.shape, n, n)
 
     # ---- private -------------------------------------------------------------------------------
 
