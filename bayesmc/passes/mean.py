@@ -76,7 +76,7 @@ def _side_by_side(density: Family) -> Any:
     columns = []
     for part in _parts(density.parameters.values()):
         is_vector = isinstance(part, MvNormal) or getattr(part, "make", None) is MvNormal
-        if not is_vector and getattr(part, "event_shape", ()):
+        if not is_vector and getattr(part, "event_shape", None):
             raise TraceError(f"the mean of {type(part).__name__} within a Joint")
         own = _mean(part)
         columns.append(own if is_vector else np.expand_dims(own, -1))

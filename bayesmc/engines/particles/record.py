@@ -462,7 +462,9 @@ def _packed(written: Sequence[Written]) -> Written:
 
 def _numbers(particles: Particles, node: CompiledNode) -> int:
     """How many numbers are worked out of a node."""
-    held = dict.get(particles.values, node.name)  # without drawing what is drawn once it is looked at
+    held = dict.get(
+        particles.values, node.name
+    )  # without drawing what is drawn once it is looked at
     if held is not None:
         return int(held.size)
     some = some_numbers([particles], node)

@@ -13,7 +13,6 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.elements.pool import Pool
 from bayesmc.network import CompiledNode
 
-
 #: of layouts, by node: worked out once
 _TURNED: WeakKeyDictionary[Layout, dict[str, np.ndarray]] = WeakKeyDictionary()
 

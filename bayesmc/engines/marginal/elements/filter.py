@@ -23,7 +23,6 @@ from bayesmc.engines.slice_steps import SlicePlan, SliceProposals
 from bayesmc.errors import UnsupportedError
 from bayesmc.network.forward import Step
 
-
 #: numbers of all elements up to which all of them are drawn to follow how the filter does
 _DRAWN = 512
 

@@ -1,7 +1,7 @@
 """A sampled vector drawn with a look at what is read of elements: the proposal of FastSLAM 2.0.
 
-Its density given the slice before is matched by a Gaussian, readings are made linear in it and in the elements
-that they pick, whose uncertainty adds to the noise, and it is drawn from what the readings leave of the
+Its density given the slice before is matched by a Gaussian, readings are made linear in it and in what they
+pick, whose uncertainty adds to the noise, and it is drawn from what the readings leave of the
 Gaussian; a tenth of the particles from its own density. Readings whose pick is not known count, in the
 proposal, as of the likeliest pick. Whatever the proposal is, the weight has p/q, and picks are summed over.
 
@@ -173,7 +173,7 @@ class Guide:
         return Gaussian(prior.mean + np.matvec(prior.root, z), root)
 
     def _rows(self, row: Row, known: Known, pool: Pool) -> list[Any]:
-        """Of each group: how readings move with the node, and how far they are off, by their own deviations."""
+        """Of each group: how readings move with the node, and how far they are off, standardised."""
         found = []
         for group in self.elements.plan.groups[min(row.t, 1)]:
             data = GroupRow(group, row)

@@ -130,7 +130,7 @@ class PickedLook:
         return found.reshape(lead[-1] if lead else 1, -1)[:, : self.count]
 
     def entries(self, values: Mapping[str, np.ndarray], at: np.ndarray) -> list[np.ndarray]:
-        """Which number of its element each entry of each way is; checked against the elements that are read."""
+        """Which number of its element each entry of each way is; checked against what is read."""
         found = self._entries(values)
         components = []
         for way, element, component in zip(self.ways, found[::2], found[1::2], strict=True):
@@ -191,7 +191,9 @@ class PickedLook:
         """How means move with the elements that are read, shape (batch, readings, d, n)."""
         n = x.shape[-1]
         moves = {
-            f"move of {way.name}": (np.arange(n)[:, None, None] == c).astype(float).reshape(n, len(c), *way.shape)
+            f"move of {way.name}": np.equal(np.arange(n)[:, None, None], c)
+            .astype(float)
+            .reshape((n, len(c), *way.shape))
             for way, c in zip(self.ways, entries, strict=True)
         }  # fmt: skip
         (found,) = self._slopes[None](values | self._leaves(entries, x) | moves)

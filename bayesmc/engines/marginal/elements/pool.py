@@ -58,7 +58,7 @@ class Pool(NamedTuple):
 
     @classmethod
     def of(cls, mean: np.ndarray, root: np.ndarray, group: np.ndarray, particles: int) -> Pool:
-        """All elements at once: ``(particles or 1, elements, n)`` and ``(particles or 1, elements, n, n)``."""
+        """All elements at once: ``(particles or 1, elements, n)`` and ``(..., n, n)``."""
         count = max(len(mean), len(root))
         elements = mean.shape[1]
         mean = np.broadcast_to(mean, (count, *mean.shape[1:])).swapaxes(0, 1)
@@ -84,9 +84,9 @@ class Pool(NamedTuple):
         """Those of ancestors, shape ``(particles,)`` or ``(particles, *apart)``."""
         chosen = ancestors.reshape(len(ancestors), -1).T
         found = [
-            g._replace(which=np.take_along_axis(g.which, np.broadcast_to(chosen, (len(g.which), chosen.shape[1])), 1))
+            g._replace(which=np.take_along_axis(g.which, np.broadcast_to(chosen, g.which.shape), 1))
             for g in self.generations
-        ]  # fmt: skip
+        ]
         return self._replace(generations=tuple(found))
 
     def of_one(self) -> Pool:

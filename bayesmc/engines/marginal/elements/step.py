@@ -124,9 +124,7 @@ class ElementFilter:
         )
         after = made.chosen(None)
         log = log + made.log[:, 0].reshape(copies, *self.weights, -1).sum(axis=-1)
-        return log, Pool.of(
-            self._flat(after.mean, 1), self._flat(after.roots(), 2), self.group, n
-        )
+        return log, Pool.of(self._flat(after.mean, 1), self._flat(after.roots(), 2), self.group, n)
 
     def repeated(self, name: str, known: Known, row: Row) -> Known:
         """Every particle with every state of a finite node."""
@@ -228,8 +226,7 @@ class ElementFilter:
                     found.slopes[none[some]] = 0.0
                 return found
 
-            rows = data.of(reading)
-            made = linearised(prior, rows, tangent, group.bent)
+            made, rows = linearised(prior, data.of(reading), tangent, group.bent)
             after, own = conditioned(prior, rows, made)
             pool = put(after)
             np.add.at(
@@ -260,7 +257,6 @@ class ElementFilter:
             at = np.where(places[..., r] < 0, 0, self.order[places[..., r]])
             own = prior_log[..., r]
             possible = np.flatnonzero(own.reshape(-1) > -np.inf)
-            rows = data.of(np.full(len(possible), r))
             prior, _ = gathered(pool, at, n)
             joint, made = np.array(own), None
             if data.present[r].any():
@@ -274,7 +270,8 @@ class ElementFilter:
                     found.slopes[looking_none(places, chosen, of[1])] = 0.0
                     return found
 
-                made = linearised(some, rows, tangent, group.bent)
+                given = data.of(np.full(len(possible), r))
+                made, rows = linearised(some, given, tangent, group.bent)
                 flat = joint.reshape(-1)
                 flat[possible] += log_predictive(some, rows, made)
                 joint = flat.reshape(own.shape)
@@ -288,7 +285,7 @@ class ElementFilter:
                 back = np.minimum(back, len(possible) - 1)
                 own_prior = Belief(prior.mean[flat], prior.root[flat])
                 kept = Tangent(*(part[back] for part in made))
-                after, _ = conditioned(own_prior, data.of(np.full(n, r)), kept)
+                after, _ = conditioned(own_prior, rows.of(back), kept)
                 gone = level == -np.inf
                 after = Belief(
                     np.where(gone[:, None], own_prior.mean, after.mean),

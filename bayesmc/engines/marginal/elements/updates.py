@@ -29,7 +29,9 @@ from bayesmc.linalg.square_root import condition_many
 #: standard deviations of the noise that a tangent may miss a reading by at the updated mean
 _MISSED = 3.0
 #: steps of Gauss and Newton, halvings of each, and the length, in standard deviations, of a step that is none
-_STEPS, _HALVINGS, _SETTLED = 30, 8, 1e-3
+_STEPS, _HALVINGS, _SETTLED = 60, 10, 1e-3
+#: share of what a reading is off that a tangent may miss along a step
+_BENT = 0.3
 
 
 class Tangent(NamedTuple):
@@ -65,6 +67,11 @@ class Row(NamedTuple):
             off = np.where(self.angles, wrap_angle(off), off)
         return np.where(self.present, off, 0.0)
 
+    def turned(self, expected: np.ndarray) -> Row:
+        """With angles near to what is expected, as numbers like others."""
+        value = np.where(self.angles, expected + self.off(expected), self.value)
+        return Row(value, self.present, np.zeros_like(self.angles))
+
     def of(self, some: np.ndarray) -> Row:
         return Row(self.value[some], self.present[some], self.angles)
 
@@ -75,12 +82,16 @@ def expected_at(prior: Belief, point: np.ndarray, found: Tangent) -> Tangent:
     return found._replace(mean=found.mean + moved)
 
 
-def linearised(prior: Belief, row: Row, at: At, bent: bool) -> Tangent:
-    """The tangent that a belief is conditioned by, with what it expects at the belief's mean."""
+def linearised(prior: Belief, row: Row, at: At, bent: bool) -> tuple[Tangent, Row]:
+    """The tangent that a belief is conditioned by, with what it expects at the belief's mean; and the row.
+
+    Angles of the row are turned so that they are off the short way round from where the tangent is taken.
+    """
     every = np.arange(len(prior.mean))
     found = at(prior.mean, every)
+    plain = row.turned(found.mean)
     if not bent:
-        return found
+        return found, plain
     finite = np.isfinite(found.mean).all(axis=-1) & np.isfinite(found.slopes).all(axis=(-2, -1))
     tame = _masked(found, finite)
     sizes = np.abs(np.diagonal(found.noise, 0, -2, -1))
@@ -90,14 +101,17 @@ def linearised(prior: Belief, row: Row, at: At, bent: bool) -> Tangent:
     is_off = ~(np.abs(missed) <= _MISSED * sizes) & row.present
     again = np.flatnonzero((is_off.any(axis=-1) | ~finite) & row.present.any(axis=-1))
     if not len(again):
-        return found
+        return found, plain
     some = Belief(prior.mean[again], prior.root[again])
     point = _mode(some, row.of(again), lambda x, which: at(x, again[which]))
-    there = expected_at(some, point, at(point, again))
+    tangent = at(point, again)
+    there = expected_at(some, point, tangent)
+    value = np.array(plain.value)
+    value[again] = row.of(again).turned(tangent.mean).value
     parts = [np.array(a) for a in found]
     for whole, own in zip(parts, there, strict=True):
         whole[again] = own
-    return Tangent(*parts)
+    return Tangent(*parts), plain._replace(value=value)
 
 
 def conditioned(prior: Belief, row: Row, found: Tangent) -> tuple[Belief, np.ndarray]:
@@ -197,28 +211,49 @@ def _mode(prior: Belief, row: Row, at: At) -> np.ndarray:
     for _ in range(_STEPS):
         if not len(going):
             break
-        some = Belief(prior.mean[going], prior.root[going])
-        target = _step(some, row.of(going), best[going], Tangent(*(a[going] for a in tangent)))
-        move, length = target - best[going], np.ones(len(going))
-        left, gone = np.arange(len(going)), np.zeros(len(going))
-        for _ in range(_HALVINGS):
-            z = best[going[left]] + length[left, None] * move[left]
-            made, own = found_at(z, going[left])
-            better = own <= cost[going[left]]
-            to = going[left[better]]
-            best[to], cost[to] = z[better], own[better]
-            gone[left[better]] = np.linalg.norm(
-                length[left[better], None] * move[left[better]], axis=-1
-            )
-            for whole, part in zip(tangent, made, strict=True):
-                whole[to] = part[better]
-            left = left[~better]
-            length[left] *= 0.5
-            if not len(left):
-                break
-        scaled = np.linalg.solve(tangent.noise[going], tangent.slopes[going] @ prior.root[going])
-        spread = 1.0 + np.sqrt(
-            np.square(scaled).sum(axis=(-2, -1))
-        )  # steps in posterior deviations
-        going = going[gone * spread > _SETTLED]
+        going = going[_moved(prior, row, going, best, tangent, found_at)]
     return prior.mean + np.matvec(prior.root, best)
+
+
+def _moved(
+    prior: Belief,
+    row: Row,
+    going: np.ndarray,
+    best: np.ndarray,
+    tangent: Tangent,
+    found_at: Callable[[np.ndarray, np.ndarray], tuple[Tangent, np.ndarray]],
+) -> np.ndarray:
+    """One step of some, in place, as long as tangents hold along it; and whether it was one.
+
+    A step is halved until what each reading is off changes about as its tangent says. So readings come nearer
+    on a straight line, which from afar no descent of their squares does.
+    """
+    some = Belief(prior.mean[going], prior.root[going])
+    own = Tangent(*(part[going] for part in tangent))
+    rows = row.of(going)
+    move = _step(some, rows, best[going], own) - best[going]
+    change = np.matvec(own.slopes, np.matvec(some.root, move))
+    off, sizes = rows.off(own.mean), np.diagonal(own.noise, 0, -2, -1)
+    allowed = _BENT * np.abs(off) + _MISSED / 6 * sizes
+    length, gone = np.ones(len(going)), np.zeros(len(going))
+    left = np.arange(len(going))
+    for _ in range(_HALVINGS):
+        z = best[going[left]] + length[left, None] * move[left]
+        made, cost = found_at(z, going[left])
+        wrong = rows.of(left).off(made.mean) - off[left] + length[left, None] * change[left]
+        if rows.angles.any():
+            wrong = np.where(rows.angles, wrap_angle(wrong), wrong)
+        wrong = np.where(rows.present[left], wrong, 0.0)
+        good = np.isfinite(cost) & (np.abs(wrong) <= allowed[left]).all(axis=-1)
+        to = going[left[good]]
+        best[to] = z[good]
+        gone[left[good]] = np.linalg.norm(length[left[good], None] * move[left[good]], axis=-1)
+        for whole, part in zip(tangent, made, strict=True):
+            whole[to] = part[good]
+        left = left[~good]
+        length[left] *= 0.5
+        if not len(left):
+            break
+    scaled = np.linalg.solve(tangent.noise[going], tangent.slopes[going] @ some.root)
+    spread = 1.0 + np.sqrt(np.square(scaled).sum(axis=(-2, -1)))  # steps in posterior deviations
+    return gone * spread > _SETTLED
