@@ -6,6 +6,7 @@ particles, however many there are.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -78,3 +79,15 @@ def answers_of(
             errors[:, numbers] = node_errors(by, block, own)
     shape = (count, *node.value_shape)
     return means.reshape(shape), variances.reshape(shape), errors.reshape(shape)
+
+
+def numbers_of(particles: Particles, node: CompiledNode) -> int:
+    """How many numbers are worked out of a node."""
+    held = dict.get(
+        particles.values, node.name
+    )  # without drawing what is drawn once it is looked at
+    if held is not None:
+        return int(held.size)
+    some = some_numbers([particles], node)
+    count = math.prod(node.value_shape) if some is None else len(some)
+    return count * len(particles.weights)

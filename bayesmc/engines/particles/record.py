@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from bayesmc.engines.filtering import (
     pass_slices,
     refuse_forecast,
 )
-from bayesmc.engines.particles.agreed import answers_of, some_numbers
+from bayesmc.engines.particles.agreed import answers_of, numbers_of, some_numbers
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
@@ -31,7 +30,7 @@ from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written
 from bayesmc.errors import QueryError
-from bayesmc.network import CompiledNode, Model
+from bayesmc.network import Model
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
@@ -256,7 +255,7 @@ class Record:
 
     def _together(self, particles: Particles) -> int:
         """Slices that are written together."""
-        numbers = sum(_numbers(particles, n) for n in self._nodes)
+        numbers = sum(numbers_of(particles, n) for n in self._nodes)
         many = NUMBERS // max(numbers, len(particles.weights))
         return min(TOGETHER, max(1, many // 2, min(FEW, many)))
 
@@ -458,15 +457,3 @@ def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
 def _packed(written: Sequence[Written]) -> Written:
     """Slices without their particles, as one."""
     return Written({what: _joined(written, what) for what in KINDS}, [], [])
-
-
-def _numbers(particles: Particles, node: CompiledNode) -> int:
-    """How many numbers are worked out of a node."""
-    held = dict.get(
-        particles.values, node.name
-    )  # without drawing what is drawn once it is looked at
-    if held is not None:
-        return int(held.size)
-    some = some_numbers([particles], node)
-    count = math.prod(node.value_shape) if some is None else len(some)
-    return count * len(particles.weights)
