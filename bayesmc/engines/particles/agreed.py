@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -91,3 +91,15 @@ def numbers_of(particles: Particles, node: CompiledNode) -> int:
     some = some_numbers([particles], node)
     count = math.prod(node.value_shape) if some is None else len(some)
     return count * len(particles.weights)
+
+
+def write_agreed(rows: Any, block: Block, by: ByFamily | None, node: CompiledNode) -> bool:
+    """Write answers about a node where particles agree on most of it; whether they do."""
+    some = some_numbers(block.slices, node)
+    if some is None:
+        return False
+    found = answers_of(block, by, node, some)
+    for what, own in zip(("means", "variances", "errors"), found, strict=True):
+        if by is not None or what != "errors":
+            rows[what][node.name] = own
+    return True

@@ -16,7 +16,7 @@ from bayesmc.engines.filtering import (
     pass_slices,
     refuse_forecast,
 )
-from bayesmc.engines.particles.agreed import answers_of, numbers_of, some_numbers
+from bayesmc.engines.particles.agreed import numbers_of, write_agreed
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
@@ -170,12 +170,7 @@ class Record:
         rows: Rows = {what: {} for what in KINDS}
         for node in self._nodes:
             name = node.name
-            some = some_numbers(slices, node)
-            if some is not None:
-                found = answers_of(block, by, node, some)
-                for what, own in zip(("means", "variances", "errors"), found, strict=True):
-                    if by is not None or what != "errors":
-                        rows[what][name] = own
+            if write_agreed(rows, block, by, node):
                 continue
             if node.domain is not None:
                 rows["tables"][name] = block.table(node)
@@ -411,8 +406,7 @@ def filtered_by(
     """
     record = Record(problem, step.layout, queries, keep, Tracker(step), names)
     rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    compared = unit == 0 and not step.too_wide
-    looks = Replicates(problem, step.plan, check) if compared else None
+    looks = None if unit or step.too_wide else Replicates(problem, step.plan, check)
     now: Particles | None = None
     is_ahead = step.machine is not None and look_back is None
     ahead = Ahead(step.machine, problem, record) if is_ahead else None
