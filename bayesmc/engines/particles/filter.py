@@ -12,7 +12,6 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.marginal import options as marginal
-from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound, warn_of_a_lonely_step
 from bayesmc.engines.particles.compiled_step import compiled_step, told
@@ -345,8 +344,8 @@ class ParticleFilter(FilterEngine):
         if self.marginalize is not None:
             split = marginal.split_asked(self, slices, static, seen)
             if split is not None:
-                plan = SlicePlan(slices, apart, static)
-                return MarginalStep(plan, split, count, checked(scheme), threshold, kept, asked)
+                own = checked(scheme), threshold, kept, asked
+                return marginal.marginal_step(self, split, slices, static, *own)
         plan = (
             OptimalPlan(slices, apart, static)
             if is_optimal

@@ -15,6 +15,7 @@ from bayesmc.engines.filtering import (
     observed_answers,
     refuse_forecast,
 )
+from bayesmc.engines.particles.agreed import numbers_of, write_agreed
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
@@ -175,6 +176,8 @@ class Record:
         rows: Rows = {what: {} for what in KINDS}
         for node in self._nodes:
             name = node.name
+            if write_agreed(rows, block, by, node):
+                continue
             if node.domain is not None:
                 rows["tables"][name] = block.table(node)
             else:
@@ -275,7 +278,7 @@ class Record:
 
     def _together(self, particles: Particles) -> int:
         """Slices that are written together."""
-        numbers = sum(particles.values[n.name].size for n in self._nodes)
+        numbers = sum(numbers_of(particles, n) for n in self._nodes)
         many = NUMBERS // max(numbers, len(particles.weights))
         return min(TOGETHER, max(1, many // 2, min(FEW, many)))
 

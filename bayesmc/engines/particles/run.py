@@ -42,7 +42,7 @@ def filtered_by(
     """
     record = Record(problem, step.layout, queries, keep, Tracker(step), names)
     rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    looks = Replicates(problem, step.plan, check) if unit == 0 else None
+    looks = None if unit or step.too_wide else Replicates(problem, step.plan, check)
     now: Particles | None = None
     is_ahead = step.machine is not None and look_back is None
     ahead = Ahead(step.machine, problem, record) if is_ahead else None

@@ -36,6 +36,7 @@ def backwards(
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """Trajectories drawn backwards, and the filter's answer."""
     step = engine.step_of(problem.slices, problem.known_static, seen=problem.seen)
+    step.whole = True
     filtered = filtered_by(engine, step, problem, seed, True, {}, progress)
     assert filtered.held is not None
     count = asked.trajectories or min(step.layout.particles, TRAJECTORIES)
