@@ -8,7 +8,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import Explanation, explain, filter, forecast, infer, most_likely, smooth
+from bayesmc.auto import (
+    Explanation,
+    explain,
+    filter,
+    forecast,
+    infer,
+    infer_many,
+    most_likely,
+    smooth,
+)
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
@@ -158,6 +167,7 @@ __all__ = [
     "filter",
     "forecast",
     "infer",
+    "infer_many",
     "io",
     "log_density",
     "map",

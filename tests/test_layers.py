@@ -29,6 +29,7 @@ auto
 pmcmc
 engines
 kernels
+workers
 dbn | structure | results
 network
 factors | montecarlo

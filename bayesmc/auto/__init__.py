@@ -2,7 +2,8 @@
 
 from bayesmc.auto.explaining import explain
 from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.many import infer_many
 from bayesmc.auto.series import filter, forecast, most_likely, smooth
 from bayesmc.auto.static import infer
 
-__all__ = ["Explanation", "explain", "filter", "forecast", "infer", "most_likely", "smooth"]
+__all__ = ["Explanation", "explain", "filter", "forecast", "infer", "infer_many", "most_likely", "smooth"]

@@ -22,6 +22,7 @@ from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
+from bayesmc.workers import check_executor
 
 #: bytes up to which an exact answer counts as cheap
 _CHEAP = 256 * 2**20
@@ -37,6 +38,7 @@ def infer(
     progress: bool | None = None,
     keep: str | Sequence[str] = "draws",
     resume: Posterior | None = None,
+    executor: Any = None,
 ) -> Posterior:
     """The posterior of a net, of a factor graph, or of a template over all its slices, given evidence.
 
@@ -61,6 +63,9 @@ def infer(
         draws of some nodes.
     resume : Posterior, optional
         An earlier posterior of the same question whose draws are continued; ``engine`` may be left out then.
+    executor : concurrent.futures.Executor, optional
+        Who works out units of work (chunks of draws, groups of chains): processes, threads, Dask, MPI. The
+        same seed gives the same bits with any, and with none; engines whose work is one unit run here.
 
     Returns
     -------
@@ -70,6 +75,8 @@ def infer(
     ------
     ModelError, EvidenceError, UnsupportedError
         With the node's name, the fault and the fix.
+    WorkerError
+        A function does not travel to the executor's workers, or these were lost over and over.
 
     Examples
     --------
@@ -80,20 +87,44 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
+    check_executor("infer", executor)
     problem = pose_any(net, evidence, inputs, resume)
-    _check_keep(keep, problem)
+    check_keep("infer", keep, problem)
     if engine is None and resume is not None:
         engine = resume.engine
-    chosen = _choose(problem)[0] if engine is None else _checked(engine)
+    chosen = able(problem, engine)
+    spread = {"executor": executor} if executor is not None and chosen.spreads else {}
+    found = chosen.run(problem, seed_sequence(rng), keep, progress, resume, **spread)
+    return checked_answer(chosen, found)
+
+
+def able(problem: Problem, engine: Any) -> Any:
+    """The engine that answers a posed problem: the one asked for, or one that is chosen.
+
+    Raises
+    ------
+    UnsupportedError
+        With one that can.
+    """
+    chosen = choice(problem) if engine is None else _checked(engine)
     reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
     if reason is not None:
         raise UnsupportedError(_with_alternative(reason, chosen, problem))
-    found = chosen.run(problem, seed_sequence(rng), keep, progress, resume)
+    return chosen
+
+
+def checked_answer(engine: Any, found: Any) -> Posterior:
+    """What an engine returned, refused if it is no posterior."""
     if not isinstance(found, Posterior):
         raise TypeError(
-            f"{type(chosen).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
+            f"{type(engine).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
         )
     return found
+
+
+def choice(problem: Problem) -> Any:
+    """The engine that answers where the user names none."""
+    return _choose(problem)[0]
 
 
 def explained(
@@ -210,16 +241,16 @@ def _with_alternative(reason: str, engine: Any, problem: Problem) -> str:
     return f"{reason}; {type(other).__name__}() can answer this"
 
 
-def _check_keep(keep: Any, problem: Problem) -> None:
+def check_keep(call: str, keep: Any, problem: Problem) -> None:
+    """Refuse a ``keep`` that names neither a way to keep draws nor nodes."""
+    fix = f'{call}(keep={keep!r}): give "draws", "summaries" or a list of node names'
     if isinstance(keep, str):
         if keep not in ("draws", "summaries"):
-            raise ValueError(
-                f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names'
-            )
+            raise ValueError(fix)
         return
     if not isinstance(keep, Sequence):
-        raise ValueError(f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names')
+        raise ValueError(fix)
     for name in keep:
         if name not in problem.model.nodes:
             hint = did_you_mean(name, problem.model.nodes)
-            raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node{hint}")
+            raise UnknownNodeError(f"{call}: keep= names {name!r}, which is not a node{hint}")

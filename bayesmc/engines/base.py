@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -49,6 +49,9 @@ class Engine:
 
     ``infer`` is the way in. An engine that cannot answer says why and names one that can.
     """
+
+    #: whether its work comes in units, so that ``run`` takes an ``executor``
+    spreads: ClassVar[bool] = False
 
     def unsupported(
         self,
