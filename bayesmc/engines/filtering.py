@@ -82,6 +82,8 @@ class FilterEngine:
     #: what its ``start`` and ``step`` return
     belief: ClassVar[type] = object
     takes_queries: ClassVar[bool] = True
+    #: whether its work comes in units, so that ``filter`` takes an ``executor``
+    spreads: ClassVar[bool] = False
     #: whether its answers are the model's, up to rounding
     is_exact: ClassVar[bool] = False
 

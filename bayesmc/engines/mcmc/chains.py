@@ -17,6 +17,7 @@ import numpy as np
 from bayesmc.engines.base import Engine
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
 from bayesmc.engines.mcmc.given import frozen_start, read_start
+from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_groups, states_of
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
@@ -58,6 +59,9 @@ class ChainEngine(Engine):
         Effective size of every number of the answer that is asked for where ``draws`` is None.
     start : dict or None
         Node -> where its chains start.
+    groups : int or None
+        Equal groups of chains that run apart, units of work for an ``executor``; None: where a sweep is
+        mostly arithmetic, and one elsewhere.
     """
 
     draws: int | None
@@ -66,6 +70,10 @@ class ChainEngine(Engine):
     thinning: int = 1
     ess: float = _ESS
     start: Mapping[str, Any] | None = None
+    groups: int | None = None
+    spreads: ClassVar[bool] = True
+    #: whether what is worth a warning is left to whoever puts groups together
+    silent: ClassVar[bool] = False
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
     #: whether its kernels learn in few sweeps, so that a warmup may end as soon as starts are forgotten
@@ -88,6 +96,7 @@ class ChainEngine(Engine):
             raise ValueError(f"{name}(draws={self.draws}, ess={self.ess:g}): give one of both")
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(name, self.start))
+        check_groups(self)
 
     def __repr__(self) -> str:
         """What was said, and the effective size where that says how many draws there are."""
@@ -148,7 +157,11 @@ class ChainEngine(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        executor: Any = None,
     ) -> Posterior:
+        groups = groups_of(self, problem)
+        if groups > 1:
+            return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
         listed, summed = not isinstance(keep, str), isinstance(keep, str) and keep == "summaries"
         free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
         names = tuple(keep) if listed else tuple(free)
@@ -171,7 +184,7 @@ class ChainEngine(Engine):
         for kernel in getattr(sampler, "kernels", ()):
             kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
         tied = self.tied(problem)
-        if tied:
+        if tied and not self.silent:
             _warn_of_ties(type(self).__name__, tied)
         try:
             held = self._held(problem, sampler, names, summed, resume, lengths)
@@ -195,7 +208,39 @@ class ChainEngine(Engine):
         if diverged is not None:
             before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
             posterior.divergences = diverged if before is None else np.hstack([before, diverged])
+        if not self.silent:
+            self._warn(posterior, sampler, finished, lengths)
+        return posterior
+
+    def _in_groups(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any,
+        progress: bool | None,
+        resume: Posterior | None,
+        executor: Any,
+        groups: int,
+    ) -> Posterior:
+        """The same by groups of chains that run apart."""
+        lengths = self.lengths(problem, keep)
+        if resume is not None:
+            summed = isinstance(resume, ChainsSums)
+            kept = resume._running.names if summed else tuple(resume._stored)  # type: ignore[attr-defined]
+            names = kept if isinstance(keep, str) else tuple(keep)
+            lengths = self._refuse_another(resume, problem, names, summed, lengths)
+        ready = replace(self, warmup=lengths.warmup, chains=lengths.chains)  # type: ignore[type-var]
+        tied = self.tied(problem)
+        if tied:
+            _warn_of_ties(type(self).__name__, tied)
+        posterior, finished = run_groups(
+            ready, problem, seed, keep, progress, resume, executor, groups
+        )
+        sampler = replace(ready, chains=lengths.chains // groups, groups=1).sampler(problem)  # type: ignore[type-var]
+        object.__setattr__(posterior, "engine", self)
         self._warn(posterior, sampler, finished, lengths)
+        if not finished:
+            posterior.checkpoint = None
         return posterior
 
     def _drawn(
@@ -319,11 +364,17 @@ class ChainEngine(Engine):
         lengths: Lengths,
     ) -> None:
         name = type(self).__name__
+        point = {} if posterior.checkpoint is None else posterior.checkpoint.state
         if not finished:
             chains, draws = posterior._chains_and_draws
             message = (
                 f"{name}: interrupted; the posterior has the {draws} draws of each of {chains} chains "
-                "made so far, and infer(..., resume=posterior) continues them"
+                "made so far, and "
+                + (
+                    "groups that were stopped cannot be continued"
+                    if GROUPS in point
+                    else "infer(..., resume=posterior) continues them"
+                )
             )
             warnings.warn(message, InterruptWarning, stacklevel=4)
         forward = self._forward(sampler)
@@ -337,10 +388,10 @@ class ChainEngine(Engine):
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, forward)
         assert posterior.checkpoint is not None
-        state = posterior.checkpoint.state
         count = getattr(sampler, "divergences", None)
-        if count is not None and count(state) is not None:
-            found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
+        for state in states_of(posterior.checkpoint.state):
+            if count is not None and count(state) is not None:
+                found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 

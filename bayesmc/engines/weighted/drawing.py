@@ -16,7 +16,7 @@ from bayesmc import diagnostics
 from bayesmc.categorical import log_sum_exp
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
-from bayesmc.engines.forward import chunk_sizes
+from bayesmc.engines.forward import chunk_count, chunk_sizes
 from bayesmc.engines.mcmc.question import difference
 from bayesmc.errors import (
     BudgetError,
@@ -106,7 +106,7 @@ class WeightedEngine(Engine):
         units = _units(problem.model, self.draws, first)
         parts = in_order(
             _unit_drawn, shared, units, executor,
-            label=self.label, total=len(units), progress=progress,
+            label=self.label, total=-(-chunk_count(problem.model, self.draws) // _CHUNKS), progress=progress,
         )  # fmt: skip
         try:
             if summed:
@@ -365,10 +365,14 @@ def treatment(problem: Problem, name: str) -> str:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _units(model: Model, draws: int, first: int) -> Sequence[tuple[int, list[int]]]:
-    """Units of work: the random stream of the first of some chunks, and how many draws each has."""
+def _units(model: Model, draws: int, first: int) -> Iterator[tuple[int, list[int]]]:
+    """Units of work: the random stream of the first of some chunks, and how many draws each has.
+
+    They are not listed before there is memory for the draws.
+    """
     sizes = chunk_sizes(model, draws)
-    return [(first + k, sizes[k : k + _CHUNKS]) for k in range(0, len(sizes), _CHUNKS)]
+    for k in range(0, len(sizes), _CHUNKS):
+        yield first + k, sizes[k : k + _CHUNKS]
 
 
 def _unit_drawn(shared: Mapping[str, Any], unit: tuple[int, list[int]]) -> Sums | list[Chunk]:
