@@ -70,6 +70,7 @@ from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.particles.islands import IslandFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
@@ -124,6 +125,7 @@ __all__ = [
     "InverseCdf",
     "InverseGamma",
     "InverseWishart",
+    "IslandFilter",
     "Joint",
     "KLD",
     "KalmanFilter",

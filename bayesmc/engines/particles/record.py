@@ -260,7 +260,7 @@ class Record:
         return self.tracker.after(self.families, earlier, block, rows)
 
     def _joined(self, what: str, steps: int) -> dict[str, np.ndarray]:
-        return first_slices(_joined(self._written, what), steps)
+        return first_slices(joined_rows(self._written, what), steps)
 
 
 class FilteredParticles(SeriesPosterior):
@@ -290,6 +290,8 @@ class FilteredParticles(SeriesPosterior):
 
     counts: np.ndarray | None = None
     anew: np.ndarray | None = None
+    #: slices after which islands exchanged; None of a filter without
+    exchanged: np.ndarray | None = None
 
     def __init__(
         self,
@@ -438,7 +440,7 @@ def filtered_by(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
+def joined_rows(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
     """Arrays of one kind, of all slices that are written."""
     names = {n: None for w in written for n in w.rows[what]}
     pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
@@ -447,4 +449,4 @@ def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
 
 def _packed(written: Sequence[Written]) -> Written:
     """Slices without their particles, as one."""
-    return Written({what: _joined(written, what) for what in KINDS}, [], [])
+    return Written({what: joined_rows(written, what) for what in KINDS}, [], [])
