@@ -6,4 +6,13 @@ from bayesmc.auto.many import infer_many
 from bayesmc.auto.series import filter, forecast, most_likely, smooth
 from bayesmc.auto.static import infer
 
-__all__ = ["Explanation", "explain", "filter", "forecast", "infer", "infer_many", "most_likely", "smooth"]
+__all__ = [
+    "Explanation",
+    "explain",
+    "filter",
+    "forecast",
+    "infer",
+    "infer_many",
+    "most_likely",
+    "smooth",
+]

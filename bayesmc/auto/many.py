@@ -137,7 +137,9 @@ def _by_tables(
     except KeyboardInterrupt:
         if not done.any():
             raise
-        told_of_interrupt("infer_many", f"{done.sum()} of {len(done)} evidence sets", InterruptWarning)
+        told_of_interrupt(
+            "infer_many", f"{done.sum()} of {len(done)} evidence sets", InterruptWarning
+        )
     assert flat is not None
     return TablePosteriors(prepared, states, log_z, flat, done)
 
@@ -224,7 +226,8 @@ def _read_inputs(inputs: Any, count: int) -> list[Any]:
     given = list(inputs)
     if len(given) != count:
         raise EvidenceError(
-            f"infer_many: {count} evidence sets and {len(given)} inputs; give one dict for all, or one for each"
+            f"infer_many: {count} evidence sets and {len(given)} inputs; give one dict for all, or one for "
+            "each"
         )
     return given
 

@@ -64,7 +64,9 @@ def several(
         done = sum(one is not None for one in found)
         if not done:
             raise
-        told_of_interrupt(call, f"{done} of {len(found)} series, and None for the others", InterruptWarning)
+        told_of_interrupt(
+            call, f"{done} of {len(found)} series, and None for the others", InterruptWarning
+        )
     return found
 
 

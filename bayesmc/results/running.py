@@ -284,11 +284,12 @@ class Sums:
             other._rescale(self.top)
         self.draws += other.draws
         self.tail.merge(other.tail)
-        pairs = [*zip(self._groups, other._groups, strict=True)]
-        for mine, theirs in ((self._single, other._single), (self._turned, other._turned)):
-            pairs += [(own, theirs[name]) for name, own in mine.items()]  # type: ignore[attr-defined]
-        for own, one in pairs:
-            own.merge(one, other.weight)  # type: ignore[arg-type]
+        for group, theirs in zip(self._groups, other._groups, strict=True):
+            group.merge(theirs, other.weight)
+        for name, single in self._single.items():
+            single.merge(other._single[name], other.weight)  # type: ignore[arg-type]
+        for name, turned in self._turned.items():
+            turned.merge(other._turned[name], other.weight)
         self.weight += other.weight
 
     @property

@@ -1,7 +1,7 @@
 """Large arrays that processes of one machine share: files in memory, mapped and not copied.
 
-A value is pickled with its arrays apart, which go to a file of ``/dev/shm`` (elsewhere of the temporary folder)
-and are mapped, read-only, by whoever opens it. Handing it on is handing on a path.
+A value is pickled with its arrays apart, which go to a file of ``/dev/shm`` (elsewhere of the temporary
+folder) and are mapped, read-only, by whoever opens it. Handing it on is handing on a path.
 """
 
 from __future__ import annotations

@@ -84,8 +84,8 @@ def _failed(error: BaseException) -> Told:
     if isinstance(error, ModuleNotFoundError) and error.name:
         root = error.name.partition(".")[0]
         error = ModuleNotFoundError(
-            f"a worker cannot import {error.name!r}, where functions of the question stand; install it there, "
-            f"or call cloudpickle.register_pickle_by_value({root}) before",
+            f"a worker cannot import {error.name!r}, where functions of the question stand; install it "
+            f"there, or call cloudpickle.register_pickle_by_value({root}) before",
             name=error.name,
         )
     try:

@@ -115,7 +115,7 @@ def _whole_state(value: Any) -> dict[str, Any] | None:
     if isinstance(value, (Model, Problem, SeriesProblem)):
         lasting = {n: v for n, v in value.cache.items() if n in _LASTING}
         return {**value.__dict__, "cache": lasting}
-    own = kind.__getstate__ is not object.__getstate__  # type: ignore[attr-defined]
+    own = kind.__getstate__ is not object.__getstate__
     if not own or hasattr(kind, "__setstate__") or isinstance(value, Captured):
         return None
     return dict(value.__dict__)

@@ -6,7 +6,7 @@ import hashlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -18,7 +18,7 @@ from concurrent.futures import (
 )
 from contextlib import suppress
 from contextvars import copy_context
-from typing import Any
+from typing import Any, NamedTuple
 
 from bayesmc.errors import WorkerError, WorkerWarning
 from bayesmc.progress import Progress
@@ -96,31 +96,38 @@ def completed(
     Exception
         What a unit raised.
     """
-    shown = False if total is None else progress
-    with Progress(total or 0, label, shown) as bar:
-        if executor is None:
-            for number, unit in enumerate(units):
-                yield number, function(shared, unit)
-                bar.advance()
-            return
-        for found in _Crew(function, shared, executor).results(iter(units)):
-            yield found
-            bar.advance()
+    options = {"label": label, "total": total, "progress": progress}
+    for number, found in _worked(function, shared, units, executor, **options):
+        if isinstance(found, _Raised):
+            raise found.error
+        yield number, found
 
 
-def in_order(*arguments: Any, **options: Any) -> Iterator[Any]:
-    """The results of ``completed`` in the order of the units, each as soon as those before are there."""
+def in_order(
+    function: Work,
+    shared: Mapping[str, Any],
+    units: Iterable[Any],
+    executor: Any = None,
+    **options: Any,
+) -> Iterator[Any]:
+    """The results of ``completed`` in the order of the units, each as soon as those before are there.
+
+    Units are worked out ahead; what one of them raises is raised when it is its turn, if it comes to that.
+    """
     early: dict[int, Any] = {}
     following = 0
-    results = completed(*arguments, **options)
+    results = _worked(function, shared, units, executor, **options)
     try:
         for number, found in results:
             early[number] = found
             while following in early:
-                yield early.pop(following)
+                due = early.pop(following)
+                if isinstance(due, _Raised):
+                    raise due.error
+                yield due
                 following += 1
     finally:
-        results.close()  # type: ignore[attr-defined]
+        results.close()
 
 
 def told_of_interrupt(call: str, done: str, category: type[Warning]) -> None:
@@ -141,6 +148,35 @@ def workers_of(executor: Any) -> int:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+class _Raised(NamedTuple):
+    """What a unit raised."""
+
+    error: BaseException
+
+
+def _worked(
+    function: Work,
+    shared: Mapping[str, Any],
+    units: Iterable[Any],
+    executor: Any = None,
+    *,
+    label: str = "",
+    total: int | None = None,
+    progress: bool | None = None,
+) -> Generator[tuple[int, Any], None, None]:
+    """Numbers of units with their results, or what they raised, as they come."""
+    shown = False if total is None else progress
+    with Progress(total or 0, label, shown) as bar:
+        if executor is None:
+            for number, unit in enumerate(units):
+                yield number, function(shared, unit)
+                bar.advance()
+            return
+        for found in _Crew(function, shared, executor).results(iter(units)):
+            yield found
+            bar.advance()
 
 
 class _Crew:
@@ -216,8 +252,11 @@ class _Crew:
                     self.count_loss(number, error)
                 again.append((number, unit))
                 continue
-            if error is not None:
+            if isinstance(error, KeyboardInterrupt):
                 raise error
+            if error is not None:
+                yield number, _Raised(error)
+                continue
             found = future.result()
             if self.here:
                 yield number, found
@@ -241,7 +280,7 @@ class _Crew:
         if told.kind == "failed":
             error, where = unpacked(told.data)
             error.add_note(f"in unit {number}, in a worker:\n{where}")
-            raise error
+            return _Raised(error)
         return unpacked(told.data, known_to(self.shared, unit))
 
     def rescued(self) -> Iterator[tuple[int, Any]]:
@@ -264,9 +303,9 @@ class _Crew:
         self.lost[number] = self.lost.get(number, 0) + 1
         if self.lost[number] >= _ATTEMPTS:
             raise WorkerError(
-                f"executor=: unit {number} lost its worker {_ATTEMPTS} times ({type(error).__name__}: {error}); "
-                "it may need more memory than a worker has: ask for fewer draws or chains at a time, or for "
-                'keep="summaries"'
+                f"executor=: unit {number} lost its worker {_ATTEMPTS} times ({type(error).__name__}: "
+                f"{error}); it may need more memory than a worker has: ask for fewer draws or chains at a "
+                'time, or for keep="summaries"'
             ) from error
 
     def replace(self, error: BaseException) -> None:

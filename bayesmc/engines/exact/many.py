@@ -1,4 +1,4 @@
-"""Exact answers to many questions on one prepared net of finite nodes: blocks of evidence sets on one tree."""
+"""Exact answers to many questions on one net of finite nodes: blocks of evidence sets on one clique tree."""
 
 from __future__ import annotations
 
@@ -98,7 +98,8 @@ class Prepared:
         variables = self.plan.tree.variables
         seen = {variables[v]: int(row[v]) for v in np.flatnonzero(row >= 0)}
         observed = {}
-        for (name, _), state in seen.items():  # type: ignore[misc]
+        for variable, state in seen.items():
+            name = str(variable[0])  # type: ignore[index]
             domain = self.problem.model[name].domain
             assert domain is not None
             value = np.array(state, dtype=domain.dtype)
@@ -195,4 +196,3 @@ class TablePosteriors(Posteriors):
         if domain is None or domain.labels is not None:
             return None
         return np.asarray(domain.numbers, dtype=float)
-

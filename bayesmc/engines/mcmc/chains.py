@@ -162,6 +162,17 @@ class ChainEngine(Engine):
         groups = groups_of(self, problem)
         if groups > 1:
             return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
+        return self._together(problem, seed, keep, progress, resume)
+
+    def _together(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any,
+        progress: bool | None,
+        resume: Posterior | None,
+    ) -> Posterior:
+        """All chains in one array."""
         listed, summed = not isinstance(keep, str), isinstance(keep, str) and keep == "summaries"
         free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
         names = tuple(keep) if listed else tuple(free)
@@ -376,7 +387,7 @@ class ChainEngine(Engine):
                     else "infer(..., resume=posterior) continues them"
                 )
             )
-            warnings.warn(message, InterruptWarning, stacklevel=4)
+            warnings.warn(message, InterruptWarning, stacklevel=5)
         forward = self._forward(sampler)
         found = poor_mixing(posterior, forward, lengths.ess)
         band = getattr(sampler, "acceptance_band", _BAND)
@@ -393,7 +404,7 @@ class ChainEngine(Engine):
             if count is not None and count(state) is not None:
                 found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
-            warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
+            warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=5)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -408,5 +419,5 @@ def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
         f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
         "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
         ReducibleWarning,
-        stacklevel=4,
+        stacklevel=5,
     )

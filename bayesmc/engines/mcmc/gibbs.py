@@ -92,8 +92,8 @@ class Gibbs(ChainEngine):
         these. What nothing observed depends on is drawn forward, wherever it starts.
     groups : int, optional
         Equal groups of chains that run apart, each with random numbers of its own: units of work for
-        ``infer(executor=)``. It belongs to the question, so that a seed gives the same draws whoever works. By
-        default one, and groups of four or more where a sweep is mostly arithmetic; it needs ``draws``.
+        ``infer(executor=)``. It belongs to the question, so that a seed gives the same draws whoever works.
+        By default one, and groups of four or more where a sweep is mostly arithmetic; it needs ``draws``.
 
     References
     ----------

@@ -1,12 +1,12 @@
 """Chains in groups: each group is a run of its own, with a seed of its own, and all are one posterior.
 
-Chains are an array axis, so that many small ones cost hardly more than one, and there is nothing to share out.
-Where a sweep is mostly arithmetic, groups cost nothing, and workers share them.
+Chains are an array axis, so that many small ones cost hardly more than one, and there is nothing to share
+out. Where a sweep is mostly arithmetic, groups cost nothing, and workers share them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -47,8 +47,8 @@ def check_groups(engine: Any) -> None:
     chains = LEAST if engine.chains is None else engine.chains
     if chains % groups:
         raise ValueError(
-            f"{name}(groups={groups}): {chains} chains do not make {groups} equal groups; choose numbers that "
-            "divide"
+            f"{name}(groups={groups}): {chains} chains do not make {groups} equal groups; choose numbers "
+            "that divide"
         )
 
 
@@ -156,7 +156,7 @@ def _start_of(
     return found
 
 
-def _parts(resume: Any, problem: Problem, member: Any, groups: int) -> Iterator[Any] | list[Any]:
+def _parts(resume: Any, problem: Problem, member: Any, groups: int) -> list[Any]:
     """An earlier posterior group by group."""
     if resume is None:
         return [None] * groups
@@ -177,7 +177,14 @@ def _parts(resume: Any, problem: Problem, member: Any, groups: int) -> Iterator[
         acceptance = {n: v[rows] for n, v in resume.acceptance.items()}
         before = Checkpoint(state, generator, at, point.observed)
         part = ChainsPosterior(
-            problem, member, stored, (own, draws), acceptance, resume.ensemble_size, resume.warmup, before
+            problem,
+            member,
+            stored,
+            (own, draws),
+            acceptance,
+            resume.ensemble_size,
+            resume.warmup,
+            before,
         )
         if resume.divergences is not None:
             part.divergences = resume.divergences[rows]

@@ -193,7 +193,7 @@ def _together(shares: np.ndarray, variances: np.ndarray, groups: np.ndarray) -> 
 
 
 def _where_known(variances: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Variances; of an island that cannot tell its own the largest of the others, if most of the weight can."""
+    """Variances; of an island that cannot tell its own the largest of the others, where most can."""
     known = np.isfinite(variances)
     if shares[known].sum() <= 0.5:
         return np.full(len(variances), np.inf)

@@ -15,10 +15,10 @@ from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.options import read_by
-from bayesmc.engines.particles.record import Record, joined_rows
+from bayesmc.engines.particles.record import Record
 from bayesmc.engines.particles.smc import Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.particles.written import KINDS, Rows, Written
+from bayesmc.engines.particles.written import KINDS, Rows, Written, joined_rows
 from bayesmc.errors import DegeneracyError
 from bayesmc.randomness import child, resumed
 from bayesmc.randomness import stream as stream_of
@@ -90,12 +90,16 @@ def pass_rows(shared: Mapping[str, Any], unit: tuple[int, int, int, Any, Any]) -
             try:
                 with in_slice(row.t):
                     now = step(old, row, rng)
-            except DegeneracyError as error:
-                died = error
+            except DegeneracyError as failure:
+                died = failure
                 break
             record.add(k, now, row)
             passed += 1
-            if old is not None and old is not getattr(cloud, "particles", None) and record.is_written:
+            if (
+                old is not None
+                and old is not getattr(cloud, "particles", None)
+                and record.is_written
+            ):
                 step.recycle(old)
         record.write()
         families, error = record.families, 0.0

@@ -98,21 +98,26 @@ class IslandFilter(FilterEngine):
         name = "IslandFilter"
         if not isinstance(self.cloud, ParticleFilter):
             raise TypeError(
-                f"{name}(cloud={self.cloud!r}): give the particle filter, IslandFilter(ParticleFilter(100_000), "
-                "islands=8)"
+                f"{name}(cloud={self.cloud!r}): give the particle filter, "
+                "IslandFilter(ParticleFilter(100_000), islands=8)"
             )
         whole = isinstance(self.islands, (int, np.integer)) and not isinstance(self.islands, bool)
         if not whole or self.islands < 1:
-            raise ValueError(f"{name}(islands={self.islands!r}): islands is a whole number, 1 or more")
+            raise ValueError(
+                f"{name}(islands={self.islands!r}): islands is a whole number, 1 or more"
+            )
         number = isinstance(self.threshold, (int, float)) and not isinstance(self.threshold, bool)
         if not number or not 0 <= self.threshold <= 1:
-            raise ValueError(f"{name}(threshold={self.threshold!r}): give a share of the islands, 0 to 1")
+            raise ValueError(
+                f"{name}(threshold={self.threshold!r}): give a share of the islands, 0 to 1"
+            )
         count = self.cloud.particles
         if self.islands == 1:
             return
         if count is None:
             raise ValueError(
-                f"{name}: say how many particles there are in all, IslandFilter(ParticleFilter(100_000), ...)"
+                f"{name}: say how many particles there are in all, "
+                "IslandFilter(ParticleFilter(100_000), ...)"
             )
         if count % self.islands or count // self.islands < 2:
             raise ValueError(
@@ -132,9 +137,9 @@ class IslandFilter(FilterEngine):
         apart = plates_apart(problem.slices)
         if apart:
             return (
-                f"IslandFilter: elements of the plate {apart[0]!r} never meet and have weights of their own, so "
-                "islands would have to exchange for each; ParticleFilter(particles) filters them side by side, "
-                "and filter takes a list of series"
+                f"IslandFilter: elements of the plate {apart[0]!r} never meet and have weights of their own, "
+                "so islands would have to exchange for each; ParticleFilter(particles) filters them side by "
+                "side, and filter takes a list of series"
             )
         return None
 
@@ -143,8 +148,8 @@ class IslandFilter(FilterEngine):
             return self.cloud.unable(problem, asked)
         if asked.what in ("smooth", "fixed-lag") or asked.keep is not None:
             return (
-                "IslandFilter keeps no particles of past slices, and does not smooth; ParticleFilter(particles) "
-                "does"
+                "IslandFilter keeps no particles of past slices, and does not smooth; "
+                "ParticleFilter(particles) does"
             )
         return super().unable(problem, asked)
 
@@ -179,7 +184,9 @@ class IslandFilter(FilterEngine):
             with ExitStack() as stack:
                 where = stack.enter_context(folder()) if shares_memory(executor) else None
                 run = _Run(self, problem, seed, queries or {}, where, executor)
-                found = run.whole(stack.enter_context(Progress(problem.steps, self.label, progress)))
+                found = run.whole(
+                    stack.enter_context(Progress(problem.steps, self.label, progress))
+                )
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
         warn_of_errors(found, self.cloud)

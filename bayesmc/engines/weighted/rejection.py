@@ -16,7 +16,6 @@ from bayesmc.engines.weighted.drawing import Kept, check_count, no_memory, passe
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import (
-    Pass,
     Step,
     potential_factors,
     refuse_noiseless,
@@ -187,7 +186,7 @@ class Rejection(Engine):
         """Take accepted draws until there are enough; the number proposed up to the last of them."""
         accepted = proposed = 0
         for tried in (one for unit in units for one in unit):
-            count = min(tried.count, self.max_proposals - proposed)
+            count = min(tried.proposed, self.max_proposals - proposed)
             picked = tried.picked[tried.picked < count][: self.draws - accepted]
             if len(picked):
                 values = {
@@ -286,7 +285,7 @@ class Tried(NamedTuple):
 
     Attributes
     ----------
-    count : int
+    proposed : int
     picked : ndarray of int
         Which were accepted.
     values : dict
@@ -295,7 +294,7 @@ class Tried(NamedTuple):
         Nodes that have a value for each draw.
     """
 
-    count: int
+    proposed: int
     picked: np.ndarray
     values: dict[str, np.ndarray]
     varying: set[str]
@@ -320,7 +319,9 @@ def _unit_tried(shared: Mapping[str, Any], unit: tuple[int, list[int]]) -> list[
     engine, problem, names = shared["engine"], shared["problem"], shared["names"]
     shapes = {n: len(problem.model[n].value_shape) for n in names}
     found = []
-    for chunk in passes(engine._steps(problem)[0], unit[1], shared["seed"], problem.inputs, unit[0]):
+    for chunk in passes(
+        engine._steps(problem)[0], unit[1], shared["seed"], problem.inputs, unit[0]
+    ):
         level = np.broadcast_to(np.exp(chunk.log_weight), chunk.batch)
         picked = np.flatnonzero(chunk.rng.random(chunk.batch) < level)
         varying = {n for n in names if chunk.values[n].ndim > shapes[n]}
