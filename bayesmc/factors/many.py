@@ -121,12 +121,14 @@ class OneOfMany(Calibrated):
         return self._whole._ratios
 
     def marginal(self, variable: Any) -> np.ndarray:
-        tree = self._bound.tree
-        start, stop = tree.program().place[tree.index[variable]]
-        return self._row[start:stop]
+        return self._marginal(self._bound.tree.index[variable])
 
     def marginals(self) -> list[np.ndarray]:
-        return [self.marginal(v) for v in self._bound.tree.variables]
+        return [self._marginal(v) for v in range(len(self._bound.tree.variables))]
+
+    def _marginal(self, v: int) -> np.ndarray:
+        start, stop = self._bound.tree.program().place[v]
+        return self._row[start:stop]
 
 
 # ---- private ------------------------------------------------------------------------------------
