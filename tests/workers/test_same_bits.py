@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
@@ -139,6 +140,10 @@ def test_same_bits_from_processes_of_every_engine(
 
 
 @pytest.mark.thorough
+@pytest.mark.skipif(
+    os.environ.get("OPENBLAS_NUM_THREADS") != "1",
+    reason="workers of loky and Dask add with one thread, so this process must, too",
+)
 def test_same_bits_from_loky_and_dask() -> None:
     loky = pytest.importorskip("loky", reason="loky is not installed")
     distributed = pytest.importorskip("distributed", reason="Dask is not installed")

@@ -17,7 +17,7 @@ import numpy as np
 from bayesmc.engines.base import Engine
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
 from bayesmc.engines.mcmc.given import frozen_start, read_start
-from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_groups, states_of
+from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_groups, state_of
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
@@ -400,9 +400,9 @@ class ChainEngine(Engine):
             found += missed_ends(posterior, forward)
         assert posterior.checkpoint is not None
         count = getattr(sampler, "divergences", None)
-        for state in states_of(posterior.checkpoint.state):
-            if count is not None and count(state) is not None:
-                found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
+        state = state_of(posterior.checkpoint.state)
+        if count is not None and count(state) is not None:
+            found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=5)
 

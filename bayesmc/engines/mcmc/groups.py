@@ -123,9 +123,12 @@ def joined(engine: Any, problem: Problem, parts: Sequence[Chains]) -> Chains:
     return found
 
 
-def states_of(state: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
-    """The states of a sampler in a checkpoint: one for each group."""
-    return state.get(GROUPS, (state,))
+def state_of(state: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A sampler's state in a checkpoint; of groups what their kernels remember, of all chains together."""
+    if GROUPS not in state:
+        return state
+    each = [own["memory"] for own in state[GROUPS] if "memory" in own]
+    return {"memory": [_beside(memories) for memories in zip(*each, strict=True)]}
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -219,4 +222,15 @@ def _chains_of(arrays: Sequence[np.ndarray], draws: int) -> np.ndarray:
         return one
     found = np.concatenate([a[:, :draws] for a in arrays])
     found.flags.writeable = False
+    return found
+
+
+def _beside(memories: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Arrays of all chains, one after the other; what is no array is that of the first group."""
+    found = dict(memories[0])
+    for name, one in found.items():
+        if isinstance(one, np.ndarray) and one.ndim:
+            found[name] = np.concatenate([memory[name] for memory in memories])
+        elif isinstance(one, Mapping):
+            found[name] = _beside([memory[name] for memory in memories])
     return found
