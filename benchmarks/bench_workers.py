@@ -122,7 +122,10 @@ def many_questions() -> str:
             for name in names:
                 posterior.probabilities(name)
 
-    times = {"infer_many": 1e6 * spent(together) / SETS, "a loop of infer": 1e6 * spent(loop) / LOOPED}
+    times = {
+        "infer_many": 1e6 * spent(together) / SETS,
+        "a loop of infer": 1e6 * spent(loop) / LOOPED,
+    }
     if peer_python() is not None:
         with Peer("exact-pyagrum", network("alarm"), 0) as peer:
             seconds = [peer.seconds(evidence) for evidence in sets[:ASKED]]

@@ -26,6 +26,7 @@ from examples import (
     faithful_gibbs,
     gnp_trend_cycle,
     growth_benchmark,
+    islands_mpi,
     ising_denoising,
     kernels_as_chains,
     kidnapped_robot,
@@ -59,7 +60,7 @@ FIGURES = (
     laser_localization, sonar_localization, kidnapped_robot, landmark_localization, range_only,
     coupled_chains, radar_target, bee_dance, gnp_trend_cycle, variational_mixture,
     fading_channel,
-    colour_map,
+    colour_map, islands_mpi,
 )  # fmt: skip
 
 

@@ -57,7 +57,9 @@ def test_each_posterior_answers_all_questions() -> None:
     assert drawn.shape == (1, 100)
     both = posteriors.expectation(lambda rain, wet: (rain == "yes") & (wet == "yes"))
     assert both.shape == (3,) and both[1] == 0.0
-    assert [p.log_marginal_likelihood for p in posteriors] == posteriors.log_marginal_likelihood.tolist()
+    assert [
+        p.log_marginal_likelihood for p in posteriors
+    ] == posteriors.log_marginal_likelihood.tolist()
     assert len(posteriors[1:]) == 2
     back = pickle.loads(pickle.dumps(posteriors))
     assert np.array_equal(back.probabilities("rain"), posteriors.probabilities("rain"))

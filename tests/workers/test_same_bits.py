@@ -52,7 +52,9 @@ def seen() -> bmc.DynamicBayesNet:
     return found
 
 
-def static(engine: Any, keep: str = "draws", name: str = "a", asked: Any = net, data: Any = DATA) -> Any:
+def static(
+    engine: Any, keep: str = "draws", name: str = "a", asked: Any = net, data: Any = DATA
+) -> Any:
     question = functools.cache(asked)
 
     def run(executor: Any) -> list[np.ndarray]:
@@ -87,7 +89,9 @@ def many(executor: Any) -> list[np.ndarray]:
 RUNS = {
     "weighting": static(bmc.LikelihoodWeighting(70_000)),
     "weighting, sums": static(bmc.LikelihoodWeighting(70_000), "summaries"),
-    "importance": static(bmc.Importance(70_000, proposal={"a": lambda y: bmc.Normal(y.mean(), 1.0)})),
+    "importance": static(
+        bmc.Importance(70_000, proposal={"a": lambda y: bmc.Normal(y.mean(), 1.0)})
+    ),
     "rejection": static(bmc.Rejection(1500), asked=coins, data={"n": 7}),
     "Gibbs": static(bmc.Gibbs(30, 10, 4, groups=2)),
     "Gibbs, sums": static(bmc.Gibbs(40, 10, 4, groups=2), "summaries"),

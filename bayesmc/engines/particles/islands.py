@@ -33,7 +33,7 @@ from bayesmc.workers import completed
 from bayesmc.workers.memory import drop, folder, shares_memory
 
 #: rows that islands pass on their own before they are looked at, at first, at least and at most
-_FIRST, _LEAST, _MOST = 16, 8, 256
+_FIRST, _LEAST, _MOST = 16, 2, 256
 
 
 @dataclass(frozen=True)
