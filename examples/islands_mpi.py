@@ -7,8 +7,8 @@ same figures to the last digit, whatever their number:
 
 The model is linear and Gaussian, so that the Kalman filter says what the evidence is. The figure shows what
 islands make of the rows: shares of the weight drift apart, and where their effective number falls below nine
-tenths, islands are resampled whole. Verge, Dubarry, Del Moral and Moulines (2015), On parallel implementation of
-sequential Monte Carlo methods: the island particle model, Statistics and Computing 25.
+tenths, islands are resampled whole. Verge, Dubarry, Del Moral and Moulines (2015), On parallel implementation
+of sequential Monte Carlo methods: the island particle model, Statistics and Computing 25.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Many evidence sets on one clique tree at once: both passes with the sets as the last axis of every table.
 
 What a message costs in calls is paid once for some hundred sets, and sums run along memory. Evidence is
-entered by zeros, so that sets may observe different variables; cliques below which no set of a block observes
-anything have one table for all. Ordinary arithmetic under NumPy's traps: a block in which something that could
-matter underflows is for `BoundTree.calibrate`, set by set.
+entered by zeros, so that sets may observe different variables; cliques below which no set of a block
+observes anything have one table for all. Ordinary arithmetic under NumPy's traps: a block in which something
+that could matter underflows is for `BoundTree.calibrate`, set by set.
 """
 
 from __future__ import annotations

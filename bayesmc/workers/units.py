@@ -96,7 +96,7 @@ def completed(
     Exception
         What a unit raised.
     """
-    options = {"label": label, "total": total, "progress": progress}
+    options: dict[str, Any] = {"label": label, "total": total, "progress": progress}
     for number, found in _worked(function, shared, units, executor, **options):
         if isinstance(found, _Raised):
             raise found.error

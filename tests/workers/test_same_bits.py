@@ -1,4 +1,4 @@
-"""The same seed gives the same bits with no executor, threads and processes, from every engine that samples."""
+"""The same seed gives the same bits with no executor, threads or processes, from all engines that sample."""
 
 from __future__ import annotations
 

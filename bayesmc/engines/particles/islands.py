@@ -126,7 +126,7 @@ class IslandFilter(FilterEngine):
         for option in ("adapt", "recovery", "delay"):
             if getattr(self.cloud, option) is not None:
                 raise ValueError(
-                    f"{name}: islands have as many particles in every row, and answer as rows come; leave out "
+                    f"{name}: islands have as many particles in every row and answer as rows come; leave out "
                     f"{option}= of the ParticleFilter, or have one island"
                 )
 
