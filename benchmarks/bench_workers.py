@@ -1,8 +1,8 @@
 """Units of work on two processes beside one and none, many questions at once, and islands of particles.
 
-``python -m benchmarks.bench_workers`` times; with ``--islands 2000`` it runs the filter with 1, 4 and 16 islands
-so often and prints means and variances of the evidence instead. Wall times of several processes say little while
-the machine does something else: look at the load.
+``python -m benchmarks.bench_workers`` times; with ``--islands 2000`` it runs the filter with 1, 4 and 16
+islands so often and prints means and variances of the evidence instead. Wall times of several processes say
+little while the machine does something else: look at the load.
 """
 
 from __future__ import annotations
