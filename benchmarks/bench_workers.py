@@ -172,7 +172,7 @@ def islands(runs: int) -> str:
             answer = bmc.filter(dbn, data, engine=engine, rng=k + 1_000_000 * count)
             found.append(float(np.exp(answer.log_marginal_likelihood - exact)))
             told.append(answer.log_marginal_likelihood_mcse)
-            exchanges += 0 if answer.exchanged is None else len(answer.exchanged)
+            exchanges += len(answer.exchanged) if count > 1 else 0
         values = np.array(found)
         plain = values.var() if plain is None else plain
         off = (values.mean() - 1) / (values.std() / np.sqrt(runs))

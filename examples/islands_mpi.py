@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for count, answers in found.items():
         logs = np.array([a.log_marginal_likelihood for a in answers])
         off = np.sqrt(np.mean((logs - exact.log_marginal_likelihood) ** 2))
-        exchanges = [0 if a.exchanged is None else len(a.exchanged) for a in answers]
+        exchanges = [len(a.exchanged) if count > 1 else 0 for a in answers]
         print(f"  {count:7}  {logs[0]:29.12f}  {off:30.4f}  {np.mean(exchanges):15.1f}")
     print(f"  exact    {exact.log_marginal_likelihood:29.12f}")
     if workers:
@@ -95,8 +95,7 @@ def figure(found: dict[int, list[Any]], exact: Any) -> Any:
         for answer in answers:
             off = np.cumsum(answer.log_marginal_increments - exact.log_marginal_increments)
             axis.plot(off, color=picture.DRAWS, linewidth=0.9)
-        exchanged = answers[0].exchanged
-        for t in () if exchanged is None else exchanged:
+        for t in answers[0].exchanged if count > 1 else ():
             axis.axvline(t, color=picture.OTHER, linewidth=0.6)
         axis.axhline(0.0, color=picture.EXACT, linewidth=1.0)
         axis.set_title(f"{count} island{'s' if count > 1 else ''}")

@@ -118,9 +118,10 @@ def filter(  # type: ignore[misc]
     >>> filtered.std("x").shape
     (3,)
     """
-    check_executor("filter", executor)
+    if executor is not None:
+        check_executor("filter", executor)
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
-    if is_several(observations):
+    if not isinstance(observations, Mapping) and is_several(observations):
         quiet, seed = {**options, "progress": False}, seed_sequence(rng)
         return several(
             "filter", _filtered, dbn, observations, inputs, engine, seed, quiet, progress, executor
@@ -179,12 +180,13 @@ def smooth(  # type: ignore[misc]
     >>> bmc.smooth(dbn, {"umbrella": [1, 1]}).probabilities("rain").round(3).tolist()
     [[0.117, 0.883], [0.117, 0.883]]
     """
-    check_executor("smooth", executor)
+    if executor is not None:
+        check_executor("smooth", executor)
     options = {
         "lag": lag, "queries": queries, "trajectories": trajectories, "backward": backward,
         "progress": progress,
     }  # fmt: skip
-    if is_several(observations):
+    if not isinstance(observations, Mapping) and is_several(observations):
         quiet, seed = {**options, "progress": False}, seed_sequence(rng)
         return several(
             "smooth", _smoothed, dbn, observations, inputs, engine, seed, quiet, progress, executor

@@ -87,7 +87,8 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
-    check_executor("infer", executor)
+    if executor is not None:
+        check_executor("infer", executor)
     problem = pose_any(net, evidence, inputs, resume)
     check_keep("infer", keep, problem)
     if engine is None and resume is not None:

@@ -75,7 +75,7 @@ def calibrate_many(bound: BoundTree, states: np.ndarray) -> Block:
     >>> bound = tree.bind([np.array([0.8, 0.2]), np.array([[0.9, 0.1], [0.1, 0.9]])])
     >>> found = calibrate_many(bound, np.array([[-1, -1], [-1, 1]]))
     >>> np.exp(found.log_z).round(4).tolist(), found.marginals[1, :2].round(4).tolist()
-    ([1.0, 0.26], [0.6923, 0.3077])
+    ([1.0, 0.26], [0.3077, 0.6923])
     """
     try:
         with np.errstate(under="raise", over="raise", invalid="raise"):

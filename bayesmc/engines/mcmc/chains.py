@@ -96,7 +96,8 @@ class ChainEngine(Engine):
             raise ValueError(f"{name}(draws={self.draws}, ess={self.ess:g}): give one of both")
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(name, self.start))
-        check_groups(self)
+        if self.groups is not None:
+            check_groups(self)
 
     def __repr__(self) -> str:
         """What was said, and the effective size where that says how many draws there are."""
@@ -159,9 +160,11 @@ class ChainEngine(Engine):
         resume: Posterior | None = None,
         executor: Any = None,
     ) -> Posterior:
-        groups = groups_of(self, problem)
-        if groups > 1:
-            return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
+        many = self.draws is not None and (self.chains or LEAST) >= 2 * LEAST
+        if self.groups is not None or many:
+            groups = groups_of(self, problem)
+            if groups > 1:
+                return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
         return self._together(problem, seed, keep, progress, resume)
 
     def _together(
@@ -400,7 +403,9 @@ class ChainEngine(Engine):
             found += missed_ends(posterior, forward)
         assert posterior.checkpoint is not None
         count = getattr(sampler, "divergences", None)
-        state = state_of(posterior.checkpoint.state)
+        state = posterior.checkpoint.state
+        if GROUPS in state:
+            state = state_of(state)
         if count is not None and count(state) is not None:
             found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:

@@ -15,10 +15,10 @@ from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.options import read_by
-from bayesmc.engines.particles.record import Record
+from bayesmc.engines.particles.record import Record, joined_rows
 from bayesmc.engines.particles.smc import Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.particles.written import KINDS, Rows, Written, joined_rows
+from bayesmc.engines.particles.written import KINDS, Rows, Written
 from bayesmc.errors import DegeneracyError
 from bayesmc.randomness import child, resumed
 from bayesmc.randomness import stream as stream_of

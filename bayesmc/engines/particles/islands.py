@@ -36,6 +36,18 @@ from bayesmc.workers.memory import drop, folder, shares_memory
 _FIRST, _LEAST, _MOST = 16, 2, 256
 
 
+class FilteredIslands(FilteredParticles):
+    """What islands of particles say of every slice.
+
+    Attributes
+    ----------
+    exchanged : ndarray of int
+        Slices after which islands were resampled.
+    """
+
+    exchanged: np.ndarray
+
+
 @dataclass(frozen=True)
 class IslandFilter(FilterEngine):
     """A particle filter whose cloud is cut into islands, for workers to share.
@@ -63,10 +75,10 @@ class IslandFilter(FilterEngine):
     -----
     ``filter(executor=)`` hands islands to workers, some rows at a time; processes of one machine share the
     particles' memory. Whether islands exchange is decided row by row all the same: rows that were passed
-    beyond one after which they should have are passed again. ``exchanged`` of the answer says after which.
+    beyond one after which they should have are passed again. ``exchanged`` of the answer says after which slices.
 
     The error of the evidence adds up what the families of each island tell (see ``ParticleFilter``), those
-    that share an ancestor among the islands of the last 50 rows counted as one.
+    that share an ancestor among those of the last 50 rows counted as one.
 
     References
     ----------
@@ -335,7 +347,7 @@ class _Run:
             "queries": combined["queries"],
             "start": self.problem.series.start,
         }
-        found = FilteredParticles(
+        found = FilteredIslands(
             self.problem.model, self.engine, "filter", answers=answers, diagnostics=combined["filter"],
             errors=(self.rows.error, combined["errors"], combined["query errors"]),
         )  # fmt: skip

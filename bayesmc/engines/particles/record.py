@@ -27,7 +27,7 @@ from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Layout, Particles, quiet
 from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written, as_one, joined_rows
+from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
 from bayesmc.progress import Progress
@@ -121,7 +121,7 @@ class Record:
         if earlier and not self.keep:
             earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
             if len(earlier) - self._packed >= TOGETHER:  # many small arrays hold more than one
-                earlier = [*earlier[: self._packed], as_one(earlier[self._packed :])]
+                earlier = [*earlier[: self._packed], _packed(earlier[self._packed :])]
                 self._packed += 1
         self._written, self._waiting = [*earlier, worked_out], []
         self._tallies, self._figures, self._summed = [], [], []
@@ -275,8 +275,6 @@ class FilteredParticles(SeriesPosterior):
         Particles of each slice: always as many, unless ``adapt=`` says otherwise.
     anew : ndarray of int, shape (time,)
         How many of them ``recovery=`` let begin anew.
-    exchanged : ndarray of int or None
-        Slices after which islands exchanged, of an ``IslandFilter``.
 
     Examples
     --------
@@ -292,7 +290,6 @@ class FilteredParticles(SeriesPosterior):
 
     counts: np.ndarray | None = None
     anew: np.ndarray | None = None
-    exchanged: np.ndarray | None = None
 
     def __init__(
         self,
@@ -436,3 +433,18 @@ def filtered_by(
     with Progress(problem.steps, engine.label, progress) as bar, quiet():
         pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
         return record.posterior(engine, predictive=None if looks is None else looks.found())
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def joined_rows(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
+    """Arrays of one kind, of all slices that are written."""
+    names = {n: None for w in written for n in w.rows[what]}
+    pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
+    return {n: np.concatenate(rows) for n, rows in pieces.items()}
+
+
+def _packed(written: Sequence[Written]) -> Written:
+    """Slices without their particles, as one."""
+    return Written({what: joined_rows(written, what) for what in KINDS}, [], [])

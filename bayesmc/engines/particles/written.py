@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -33,15 +33,3 @@ class Written(NamedTuple):
     rows: Rows
     families: list[Families]
     particles: list[Particles]
-
-
-def joined_rows(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
-    """Arrays of one kind, of all slices that are written."""
-    names = {n: None for w in written for n in w.rows[what]}
-    pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
-    return {n: np.concatenate(rows) for n, rows in pieces.items()}
-
-
-def as_one(written: Sequence[Written]) -> Written:
-    """Slices without their particles, as one."""
-    return Written({what: joined_rows(written, what) for what in KINDS}, [], [])
