@@ -75,7 +75,7 @@ class IslandFilter(FilterEngine):
     -----
     ``filter(executor=)`` hands islands to workers, some rows at a time; processes of one machine share the
     particles' memory. Whether islands exchange is decided row by row all the same: rows that were passed
-    beyond one after which they should have are passed again. ``exchanged`` of the answer says after which slices.
+    beyond one after which they should have are passed again. ``exchanged`` of the answer says where.
 
     The error of the evidence adds up what the families of each island tell (see ``ParticleFilter``), those
     that share an ancestor among those of the last 50 rows counted as one.
