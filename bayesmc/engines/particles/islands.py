@@ -19,10 +19,10 @@ from bayesmc.engines.filtering import (
     hand_over,
     observed_answers,
 )
+from bayesmc.engines.particles.enough import warn_of_errors
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.island_answers import IslandRows, answered
 from bayesmc.engines.particles.island_rows import Passed, pass_rows
-from bayesmc.engines.particles.options import warn_of_errors
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError
