@@ -8,7 +8,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import Explanation, explain, filter, forecast, infer, load, most_likely, smooth
+from bayesmc.auto import (
+    Explanation,
+    explain,
+    filter,
+    forecast,
+    infer,
+    infer_many,
+    load,
+    most_likely,
+    smooth,
+)
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
@@ -61,6 +71,7 @@ from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.particles.islands import IslandFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
@@ -117,6 +128,7 @@ __all__ = [
     "InverseCdf",
     "InverseGamma",
     "InverseWishart",
+    "IslandFilter",
     "Joint",
     "KLD",
     "KalmanFilter",
@@ -160,6 +172,7 @@ __all__ = [
     "filter",
     "forecast",
     "infer",
+    "infer_many",
     "io",
     "load",
     "log_density",

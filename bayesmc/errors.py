@@ -230,6 +230,10 @@ class MissingExtraError(BayesmcError, ImportError):
     """An optional dependency is not installed; the message says which extra brings it."""
 
 
+class WorkerError(BayesmcError, RuntimeError):
+    """What an executor was asked to do does not travel to its workers, or they were lost over and over."""
+
+
 class BayesmcWarning(UserWarning):
     """Base of every warning issued by bayesmc."""
 
@@ -272,6 +276,10 @@ class ModelMisfitWarning(BayesmcWarning):
 
 class EngineWarning(BayesmcWarning):
     """An option has another engine answer than would without it, or an engine leaves something out."""
+
+
+class WorkerWarning(BayesmcWarning):
+    """A worker of an executor was lost; what it was at is run again."""
 
 
 class LogWarning(BayesmcWarning):

@@ -27,6 +27,7 @@ from examples import (
     gnp_trend_cycle,
     growth_benchmark,
     ising_denoising,
+    islands_mpi,
     kernels_as_chains,
     kidnapped_robot,
     landmark_localization,
@@ -63,7 +64,7 @@ FIGURES = (
     slam_landmarks,
     coupled_chains, radar_target, bee_dance, gnp_trend_cycle, variational_mixture,
     fading_channel,
-    colour_map, talking_head, pedestrians,
+    colour_map, talking_head, pedestrians, islands_mpi,
 )  # fmt: skip
 
 

@@ -30,6 +30,7 @@ auto
 pmcmc
 engines
 kernels
+workers
 dbn | structure | results
 network
 factors | montecarlo

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.files import Opened
+from bayesmc.auto.several import is_several, several
 from bayesmc.auto.switching import REASON, settled_or_kim, why_too_long, within_budget
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
@@ -26,6 +27,7 @@ from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior
+from bayesmc.workers import check_executor
 
 #: engines in the order in which they are tried
 _CANDIDATES: tuple[type[FilterEngine], ...] = (
@@ -49,18 +51,27 @@ _WHY = {
 _QUESTIONS = ("filter", "smooth", "fixed-lag", "forecast", "most_likely")
 
 
+@overload
 def filter(
+    dbn: DynamicBayesNet, observations: Mapping[str, Any], **options: Any
+) -> SeriesPosterior: ...
+@overload
+def filter(
+    dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
+) -> list[SeriesPosterior]: ...
+def filter(  # type: ignore[misc]
     dbn: DynamicBayesNet,
-    observations: Mapping[str, Any],
+    observations: Any,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
     keep: str | None = None,
     queries: Queries | None = None,
     checkpoint: Any = None,
-) -> SeriesPosterior:
+    executor: Any = None,
+) -> Any:
     """Beliefs about every slice given the rows up to it.
 
     Parameters
@@ -68,12 +79,14 @@ def filter(
     dbn : DynamicBayesNet
     observations : dict
         Node -> its rows, time first, shape ``(time, *plates, *event)``. Row k belongs to slice k; NaN, a
-        masked entry or None is missing. Static nodes are given without time.
+        masked entry or None is missing. Static nodes are given without time. A list of such dicts is one of
+        independent series, each with an answer of its own.
     inputs : dict, optional
-        Input -> its rows, time first.
+        Input -> its rows, time first; of several series a list of such, or one for all.
     engine : optional
         ``ParticleFilter(particles)``, ...; None chooses (see ``explain``).
     rng : seed, SeedSequence, Generator or None
+        Of several series each draws from a child of the seed.
     keep : "particles", optional
         Hold the particles of all slices, for queries afterwards; memory grows with time.
     queries : dict, optional
@@ -83,10 +96,14 @@ def filter(
     checkpoint : path or CheckpointFile, optional
         A file in which a particle filter saves itself as the slices pass (the extra ``netcdf``), and other
         filters their answer; the same call goes on where the run was, with the same bits (see ``infer``).
+    executor : concurrent.futures.Executor, optional
+        Who works out units of work: series of a list, islands of an ``IslandFilter``. The same seed gives
+        the same bits with any, and with none.
 
     Returns
     -------
     SeriesPosterior
+        Of several series a list of them.
 
     Raises
     ------
@@ -111,11 +128,22 @@ def filter(
     >>> filtered.std("x").shape
     (3,)
     """
+    if executor is not None:
+        check_executor("filter", executor)
+    options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
+    if not isinstance(observations, Mapping) and is_several(observations):
+        if checkpoint is not None:
+            raise ValueError("filter(checkpoint=): a file holds one series; filter them one by one")
+        quiet, seed = {**options, "progress": False}, seed_sequence(rng)
+        return several(
+            "filter", _filtered, dbn, observations, inputs, engine, seed, quiet, progress, executor
+        )
     problem = pose_series(dbn, observations, inputs)
     opened = None if checkpoint is None else Opened("filter", checkpoint, problem)
     engine = opened.engine if engine is None and opened is not None else engine
     chosen = _engine(problem, engine, Asked("filter", keep, read_queries("filter", queries)))
-    options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
+    if executor is not None and chosen.spreads:
+        options["executor"] = executor
     if opened is None:
         return chosen.filter(problem, seed_sequence(rng), **options)
     seed = opened.seed(rng)
@@ -130,11 +158,19 @@ def filter(
     return found
 
 
+@overload
 def smooth(
+    dbn: DynamicBayesNet, observations: Mapping[str, Any], **options: Any
+) -> SeriesPosterior: ...
+@overload
+def smooth(
+    dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
+) -> list[SeriesPosterior]: ...
+def smooth(  # type: ignore[misc]
     dbn: DynamicBayesNet,
-    observations: Mapping[str, Any],
+    observations: Any,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -142,10 +178,11 @@ def smooth(
     queries: Queries | None = None,
     trajectories: int | None = None,
     backward: str | None = None,
-) -> SeriesPosterior:
+    executor: Any = None,
+) -> Any:
     """Beliefs about every slice given all rows, or with ``lag`` given those up to so many slices later.
 
-    Other parameters and errors are those of ``filter``.
+    Other parameters and errors are those of ``filter``, several series and an executor for them included.
 
     Warns
     -----
@@ -174,25 +211,18 @@ def smooth(
     >>> bmc.smooth(dbn, {"umbrella": [1, 1]}).probabilities("rain").round(3).tolist()
     [[0.117, 0.883], [0.117, 0.883]]
     """
-    problem = pose_series(dbn, observations, inputs)
-    if lag is not None and (
-        isinstance(lag, bool) or not isinstance(lag, (int, np.integer)) or lag < 0
-    ):
-        raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
-    kind = "smooth" if lag is None else "fixed-lag"
-    chosen = _engine(problem, engine, Asked(kind, None, read_queries("smooth", queries)))
-    own = {"trajectories": trajectories, "backward": backward}
-    options: dict[str, Any] = {n: given for n, given in own.items() if given is not None}
-    if options and not isinstance(chosen, ParticleFilter):
-        name = next(iter(options))
-        raise ValueError(
-            f"smooth({name}={options[name]!r}): it says how particles are smoothed, and "
-            f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
+    if executor is not None:
+        check_executor("smooth", executor)
+    options = {
+        "lag": lag, "queries": queries, "trajectories": trajectories, "backward": backward,
+        "progress": progress,
+    }  # fmt: skip
+    if not isinstance(observations, Mapping) and is_several(observations):
+        quiet, seed = {**options, "progress": False}, seed_sequence(rng)
+        return several(
+            "smooth", _smoothed, dbn, observations, inputs, engine, seed, quiet, progress, executor
         )
-    if engine is None and isinstance(chosen, ExpectationPropagation):
-        return settled_or_kim(chosen, problem, seed_sequence(rng), queries, progress)
-    options |= {"lag": lag, "queries": queries, "progress": progress}
-    return chosen.smooth(problem, seed_sequence(rng), **options)
+    return _smoothed(pose_series(dbn, observations, inputs), engine, seed_sequence(rng), options)
 
 
 def forecast(
@@ -285,6 +315,44 @@ def explained_series(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _filtered(
+    problem: SeriesProblem,
+    engine: FilterEngine | None,
+    seed: np.random.SeedSequence,
+    options: dict[str, Any],
+) -> SeriesPosterior:
+    queries = read_queries("filter", options["queries"])
+    chosen = _engine(problem, engine, Asked("filter", options["keep"], queries))
+    return chosen.filter(problem, seed, **options)
+
+
+def _smoothed(
+    problem: SeriesProblem,
+    engine: FilterEngine | None,
+    seed: np.random.SeedSequence,
+    options: dict[str, Any],
+) -> SeriesPosterior:
+    lag, queries = options["lag"], options["queries"]
+    if lag is not None and (
+        isinstance(lag, bool) or not isinstance(lag, (int, np.integer)) or lag < 0
+    ):
+        raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
+    kind = "smooth" if lag is None else "fixed-lag"
+    chosen = _engine(problem, engine, Asked(kind, None, read_queries("smooth", queries)))
+    own = ("trajectories", "backward")
+    given = {n: options[n] for n in own if options[n] is not None}
+    if given and not isinstance(chosen, ParticleFilter):
+        name = next(iter(given))
+        raise ValueError(
+            f"smooth({name}={given[name]!r}): it says how particles are smoothed, and "
+            f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
+        )
+    if engine is None and isinstance(chosen, ExpectationPropagation):
+        return settled_or_kim(chosen, problem, seed, queries, options["progress"])
+    given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
+    return chosen.smooth(problem, seed, **given)
 
 
 def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -> FilterEngine:

@@ -23,6 +23,7 @@ from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
+from bayesmc.workers import check_executor
 
 #: bytes up to which an exact answer counts as cheap
 _CHEAP = 256 * 2**20
@@ -39,6 +40,7 @@ def infer(
     keep: str | Sequence[str] = "draws",
     resume: Posterior | None = None,
     checkpoint: Any = None,
+    executor: Any = None,
 ) -> Posterior:
     """The posterior of a net, of a factor graph, or of a template over all its slices, given evidence.
 
@@ -68,6 +70,9 @@ def infer(
         A file in which the run saves itself as it goes on (the extra ``netcdf``). The same call goes on where
         the run was, whatever happened to the process, and ends with the same bits as one that was never
         stopped; once it has ended, the call returns the answer that is in the file.
+    executor : concurrent.futures.Executor, optional
+        Who works out units of work (chunks of draws, groups of chains): processes, threads, Dask, MPI. The
+        same seed gives the same bits with any, and with none; engines whose work is one unit run here.
 
     Returns
     -------
@@ -79,6 +84,8 @@ def infer(
         With the node's name, the fault and the fix.
     CheckpointError, DamagedFileError
         The file is of another run, and the message says what differs; the disk is full; or it was cut off.
+    WorkerError
+        A function does not travel to the executor's workers, or these were lost over and over.
 
     Examples
     --------
@@ -89,26 +96,51 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
+    if executor is not None:
+        check_executor("infer", executor)
     problem = pose_any(net, evidence, inputs, resume)
-    _check_keep(keep, problem, checkpoint)
+    check_keep("infer", keep, problem, checkpoint)
     if engine is None and resume is not None:
         engine = resume.engine
     opened = None if checkpoint is None else _opened(checkpoint, problem, resume)
     if engine is None and opened is not None:
         engine = opened.engine
-    chosen = _choose(problem)[0] if engine is None else _checked(engine)
+    chosen = able(problem, engine)
+    spread = {"executor": executor} if executor is not None and chosen.spreads else {}
+    if opened is None:
+        found = chosen.run(problem, seed_sequence(rng), keep, progress, resume, **spread)
+    else:
+        found = _run_saved(opened, chosen, rng, keep, progress, spread)
+    return checked_answer(chosen, found)
+
+
+def able(problem: Problem, engine: Any) -> Any:
+    """The engine that answers a posed problem: the one asked for, or one that is chosen.
+
+    Raises
+    ------
+    UnsupportedError
+        With one that can.
+    """
+    chosen = choice(problem) if engine is None else _checked(engine)
     reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
     if reason is not None:
         raise UnsupportedError(_with_alternative(reason, chosen, problem))
-    if opened is None:
-        found = chosen.run(problem, seed_sequence(rng), keep, progress, resume)
-    else:
-        found = _run_saved(opened, chosen, rng, keep, progress)
+    return chosen
+
+
+def checked_answer(engine: Any, found: Any) -> Posterior:
+    """What an engine returned, refused if it is no posterior."""
     if not isinstance(found, Posterior):
         raise TypeError(
-            f"{type(chosen).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
+            f"{type(engine).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
         )
     return found
+
+
+def choice(problem: Problem) -> Any:
+    """The engine that answers where the user names none."""
+    return _choose(problem)[0]
 
 
 def explained(
@@ -203,7 +235,14 @@ def _opened(checkpoint: Any, problem: Problem, resume: Posterior | None) -> Open
     return Opened("infer", checkpoint, problem)
 
 
-def _run_saved(opened: Opened, engine: Any, rng: Any, keep: Any, progress: bool | None) -> Any:
+def _run_saved(
+    opened: Opened,
+    engine: Any,
+    rng: Any,
+    keep: Any,
+    progress: bool | None,
+    spread: Mapping[str, Any],
+) -> Any:
     """The answer of a run that is saved as it goes on."""
     if (keep == "file" or isinstance(keep, Mapping)) and not engine.saves:
         raise UnsupportedError(
@@ -215,8 +254,8 @@ def _run_saved(opened: Opened, engine: Any, rng: Any, keep: Any, progress: bool 
     if file is None:
         return answer
     if engine.saves:
-        return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file)
-    found = engine.run(opened.problem, seed, keep, progress, None)
+        return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file, **spread)
+    found = engine.run(opened.problem, seed, keep, progress, None, **spread)
     file.finish(found)
     return found
 
@@ -252,21 +291,22 @@ def _with_alternative(reason: str, engine: Any, problem: Problem) -> str:
     return f"{reason}; {type(other).__name__}() can answer this"
 
 
-def _check_keep(keep: Any, problem: Problem, checkpoint: Any) -> None:
+def check_keep(call: str, keep: Any, problem: Problem, checkpoint: Any = None) -> None:
+    """Refuse a ``keep`` that names neither a way to keep draws nor nodes."""
     choices = (
         'give "draws", "summaries", "file", a list of node names, or {"file": a list of node names}'
     )
     in_file = keep == "file" or (isinstance(keep, Mapping) and [*keep] == ["file"])
     if in_file and checkpoint is None:
-        raise ValueError(f'infer(keep={keep!r}): in which file? give checkpoint="run.nc"')
+        raise ValueError(f'{call}(keep={keep!r}): in which file? give checkpoint="run.nc"')
     listed = keep["file"] if in_file and isinstance(keep, Mapping) else keep
     if isinstance(listed, str):
         if isinstance(keep, Mapping) or keep not in ("draws", "summaries", "file"):
-            raise ValueError(f"infer(keep={keep!r}): {choices}")
+            raise ValueError(f"{call}(keep={keep!r}): {choices}")
         return
     if not isinstance(listed, Sequence):
-        raise ValueError(f"infer(keep={keep!r}): {choices}")
+        raise ValueError(f"{call}(keep={keep!r}): {choices}")
     for name in listed:
         if name not in problem.model.nodes:
             hint = did_you_mean(name, problem.model.nodes)
-            raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node{hint}")
+            raise UnknownNodeError(f"{call}: keep= names {name!r}, which is not a node{hint}")

@@ -68,6 +68,8 @@ class Engine:
 
     #: whether ``run`` takes ``checkpoint=`` and saves itself as it goes on; others are saved at the end
     saves: ClassVar[bool] = False
+    #: whether its work comes in units, so that ``run`` takes an ``executor``
+    spreads: ClassVar[bool] = False
 
     def unsupported(
         self,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -216,6 +216,25 @@ class RunningChains:
         self._constant: dict[str, np.ndarray] = {}
         self._means: dict[str, _BatchMeans] = {}
 
+    @staticmethod
+    def joined(parts: Sequence[RunningChains]) -> RunningChains:
+        """The chains of several runs of the same length as those of one."""
+        one = parts[0]
+        if len({(part.draws, part.chains) for part in parts}) > 1:
+            raise UnsupportedError(
+                'infer: keep="summaries" cannot put groups of chains of unlike lengths together, as Ctrl-C '
+                'leaves them; keep="draws" can'
+            )
+        found = copy.copy(one)
+        found.chains = sum(part.chains for part in parts)
+        found._sums = Sums(one._sums.model, one.names)
+        for part in parts:
+            found._sums.merge(copy.deepcopy(part._sums, {id(one._sums.model): one._sums.model}))
+        buffers = {n: np.concatenate([p._buffers[n] for p in parts], 1) for n in one._buffers}
+        means = {n: _BatchMeans.joined([p._means[n] for p in parts]) for n in one._means}
+        found._buffers, found._means = buffers, means
+        return found
+
     @property
     def names(self) -> tuple[str, ...]:
         return self._sums.names
@@ -317,6 +336,16 @@ class _BatchMeans:
         self._length = 1
         self._sum: Any = 0.0
         self._count = 0
+
+    @staticmethod
+    def joined(parts: Sequence[_BatchMeans]) -> _BatchMeans:
+        """Those of other chains beside them."""
+        found = copy.copy(parts[0])
+        each = zip(*(part._kept for part in parts), strict=True)
+        found._kept = [np.concatenate(means) for means in each]
+        if found._count:
+            found._sum = np.concatenate([part._sum for part in parts])
+        return found
 
     def add(self, mean: np.ndarray) -> None:
         """Take in the mean of one more buffer, shape ``(chain, ...)``."""

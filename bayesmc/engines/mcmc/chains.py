@@ -15,8 +15,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.engines.base import Engine, kept_names
-from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
+from bayesmc.engines.mcmc.convergence import (
+    poor_acceptance,
+    poor_mixing,
+    share_reached,
+    warn_of_ties,
+)
 from bayesmc.engines.mcmc.given import frozen_start, read_start
+from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_groups, state_of
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
@@ -29,7 +35,6 @@ from bayesmc.engines.weighted.drawing import check_count, no_memory
 from bayesmc.errors import (
     ConvergenceWarning,
     InterruptWarning,
-    ReducibleWarning,
     UnsupportedError,
 )
 from bayesmc.network import Problem
@@ -60,6 +65,9 @@ class ChainEngine(Engine):
         Effective size of every number of the answer that is asked for where ``draws`` is None.
     start : dict or None
         Node -> where its chains start.
+    groups : int or None
+        Equal groups of chains that run apart, units of work for an ``executor``; None: where a sweep is
+        mostly arithmetic, and one elsewhere.
     """
 
     draws: int | None
@@ -68,6 +76,10 @@ class ChainEngine(Engine):
     thinning: int = 1
     ess: float = _ESS
     start: Mapping[str, Any] | None = None
+    groups: int | None = None
+    spreads: ClassVar[bool] = True
+    #: whether what is worth a warning is left to whoever puts groups together
+    silent: ClassVar[bool] = False
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
     #: whether its kernels learn in few sweeps, so that a warmup may end as soon as starts are forgotten
@@ -91,6 +103,8 @@ class ChainEngine(Engine):
             raise ValueError(f"{name}(draws={self.draws}, ess={self.ess:g}): give one of both")
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(name, self.start))
+        if self.groups is not None:
+            check_groups(self)
 
     def __repr__(self) -> str:
         """What was said, and the effective size where that says how many draws there are."""
@@ -154,8 +168,31 @@ class ChainEngine(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        executor: Any = None,
         checkpoint: RunFile | None = None,
     ) -> Posterior:
+        many = self.draws is not None and (self.chains or LEAST) >= 2 * LEAST
+        if self.groups is not None or (many and checkpoint is None):
+            groups = groups_of(self, problem)
+            if groups > 1 and checkpoint is not None:
+                raise UnsupportedError(
+                    f"{type(self).__name__}(groups={groups}): runs in groups are not saved; leave "
+                    "checkpoint= or groups= away"
+                )
+            if groups > 1:
+                return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
+        return self._together(problem, seed, keep, progress, resume, checkpoint)
+
+    def _together(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any,
+        progress: bool | None,
+        resume: Posterior | None,
+        checkpoint: RunFile | None = None,
+    ) -> Posterior:
+        """All chains in one array."""
         names, summed, spilled = kept_names(keep, problem)
         asked = lengths = self.lengths(problem, keep)
         if resume is not None:
@@ -194,7 +231,41 @@ class ChainEngine(Engine):
         if checkpoint is not None and saving is not None and finished:
             lazily = saving.lazily(lengths.chains, held.draws) if spilled else None
             checkpoint.finish(posterior, lazily)
+        if not self.silent:
+            self._warn(posterior, sampler, finished, lengths)
+        if not finished:
+            posterior.checkpoint = None
+        return posterior
+
+    def _in_groups(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any,
+        progress: bool | None,
+        resume: Posterior | None,
+        executor: Any,
+        groups: int,
+    ) -> Posterior:
+        """The same by groups of chains that run apart."""
+        lengths = self.lengths(problem, keep)
+        if resume is not None:
+            summed = isinstance(resume, ChainsSums)
+            kept = resume._running.names if summed else tuple(resume._stored)  # type: ignore[attr-defined]
+            names = kept if isinstance(keep, str) else tuple(keep)
+            lengths = self._refuse_another(resume, problem, names, summed, lengths)
+        ready = replace(self, warmup=lengths.warmup, chains=lengths.chains)  # type: ignore[type-var]
+        tied = self.tied(problem)
+        if tied:
+            warn_of_ties(type(self).__name__, tied)
+        posterior, finished = run_groups(
+            ready, problem, seed, keep, progress, resume, executor, groups
+        )
+        sampler = replace(ready, chains=lengths.chains // groups, groups=1).sampler(problem)  # type: ignore[type-var]
+        object.__setattr__(posterior, "engine", self)
         self._warn(posterior, sampler, finished, lengths)
+        if not finished:
+            posterior.checkpoint = None
         return posterior
 
     def _ready(self, problem: Problem, asked: Lengths, lengths: Lengths, is_new: bool) -> Sampler:
@@ -215,8 +286,8 @@ class ChainEngine(Engine):
         for kernel in getattr(sampler, "kernels", ()):
             kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
         tied = self.tied(problem)
-        if tied:
-            _warn_of_ties(type(self).__name__, tied)
+        if tied and not self.silent:
+            warn_of_ties(type(self).__name__, tied)
         return sampler
 
     def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
@@ -353,13 +424,19 @@ class ChainEngine(Engine):
         lengths: Lengths,
     ) -> None:
         name = type(self).__name__
+        point = {} if posterior.checkpoint is None else posterior.checkpoint.state
         if not finished:
             chains, draws = posterior._chains_and_draws
             message = (
                 f"{name}: interrupted; the posterior has the {draws} draws of each of {chains} chains "
-                "made so far, and infer(..., resume=posterior) continues them"
+                "made so far, and "
+                + (
+                    "groups that were stopped cannot be continued"
+                    if GROUPS in point
+                    else "infer(..., resume=posterior) continues them"
+                )
             )
-            warnings.warn(message, InterruptWarning, stacklevel=4)
+            warnings.warn(message, InterruptWarning, stacklevel=5)
         forward = self._forward(sampler)
         found = poor_mixing(posterior, forward, lengths.ess)
         band = getattr(sampler, "acceptance_band", _BAND)
@@ -371,25 +448,11 @@ class ChainEngine(Engine):
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, forward)
         assert posterior.checkpoint is not None
-        state = posterior.checkpoint.state
         count = getattr(sampler, "divergences", None)
+        state = posterior.checkpoint.state
+        if GROUPS in state:
+            state = state_of(state)
         if count is not None and count(state) is not None:
             found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
-            warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
-    """Warn that zeros in tables may hold chains."""
-    shown = ", ".join(map(repr, names[:6]))
-    if len(names) > 6:
-        shown += f" and {len(names) - 6} more"
-    warnings.warn(
-        f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
-        "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
-        ReducibleWarning,
-        stacklevel=5,
-    )
+            warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=5)

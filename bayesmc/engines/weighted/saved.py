@@ -13,8 +13,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.network import Problem
-from bayesmc.network.forward import Pass
-from bayesmc.results import DrawsPosterior, RunFile, Sums
+from bayesmc.results import DrawsPosterior, Posterior, RunFile, Sums, SumsPosterior
 from bayesmc.results.running import Tail
 from bayesmc.storage import Lazy
 
@@ -88,11 +87,11 @@ class SavedDraws:
         """What was saved last."""
         return self.saver.state
 
-    def drawn(self, chunk: Pass) -> None:
-        """Take in a chunk of draws, and save those that wait if it is time."""
-        count = chunk.batch[0]
-        values = {n: chunk.values[n] for n in self.names}
-        logs = np.broadcast_to(np.asarray(chunk.log_weight, dtype=float), (count,))
+    def drawn(self, chunk: tuple[Mapping[str, np.ndarray], Any, int]) -> None:
+        """Take in a chunk of draws (values, log weights, count), and save those that wait if it is time."""
+        drawn, log_weight, count = chunk
+        values = {n: drawn[n] for n in self.names}
+        logs = np.broadcast_to(np.asarray(log_weight, dtype=float), (count,))
         self._waiting.append((values, logs, count))
         self._size += sum(v.nbytes for v in values.values()) + logs.nbytes
         self.chunks += 1
@@ -100,9 +99,9 @@ class SavedDraws:
         if self.saver.due() or (self.spilled and self._size >= _HELD):
             self.flush()
 
-    def passed(self, sums: Sums) -> None:
-        """Save the sums after another chunk if it is time."""
-        self.chunks += 1
+    def passed(self, sums: Sums, chunks: int) -> None:
+        """Save the sums after some more chunks if it is time."""
+        self.chunks += chunks
         self.count = sums.draws
         if self.saver.due():
             self.saver.save(None, self._state(sums.without_model()))
@@ -174,6 +173,22 @@ class SavedDraws:
             found["weights"] = Lazy((1, draws), kind, partial(self._weights, top))
         return found
 
+    def posterior(
+        self, engine: Any, tail: WeightTail, weighted: bool, streams: int
+    ) -> tuple[SpilledDraws, dict[str, Any]]:
+        """The posterior of draws in the file, and these."""
+        lazily = self.lazily(engine.draws, weighted, tail.top)
+        stand_ins = self.stand_ins(lazily)
+        log_weights, weights = stand_ins.pop("log_weights", None), stand_ins.pop("weights", None)
+        found = SpilledDraws(
+            self.problem, engine, stand_ins, (1, engine.draws), independent=True, streams=streams
+        )
+        found.log_weights, found.weights = log_weights, weights
+        if weighted:
+            found.weight_ess = float(tail.weight[0] ** 2 / tail.weight[1])
+            found.tail_pareto_k = tail.pareto_k
+        return found, lazily
+
     @staticmethod
     def stand_ins(lazily: Mapping[str, Any]) -> dict[str, np.ndarray]:
         """Arrays of the same shapes that take no room."""
@@ -199,3 +214,16 @@ class SavedDraws:
         total = sum(float(np.exp(piece - top).sum()) for piece in self._log_weights())
         for at, piece in self._pieces("log_weights"):
             yield at, np.exp(piece - top) / total
+
+
+def drawn_so_far(engine: Any, problem: Problem, file: RunFile) -> Posterior | None:
+    """What a run has come to that has not ended; None where that is nothing."""
+    saving = SavedDraws(file, problem, (), False)
+    if not saving.count or saving.state is None:
+        return None
+    weighted = engine.is_weighted(problem)
+    if saving.state["sums"] is not None:
+        return SumsPosterior(problem, engine, saving.sums(), weighted)
+    stored, log_weights = saving.stored()
+    given = log_weights if weighted else None
+    return DrawsPosterior(problem, engine, stored, log_weights.shape, given, independent=True)

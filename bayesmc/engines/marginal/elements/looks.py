@@ -163,7 +163,7 @@ class PickedLook:
         ------
         ParameterError
         """
-        *parameters, mean = self.moments(values | self._leaves(entries, x))
+        *parameters, mean = self.moments({**values, **self._leaves(entries, x)})
         node, batch = self.node, len(x)
         shape = (batch, *node.value_shape)
         result = made_of(self._result, iter(parameters))
@@ -196,7 +196,7 @@ class PickedLook:
             .reshape((n, len(c), *way.shape))
             for way, c in zip(self.ways, entries, strict=True)
         }  # fmt: skip
-        (found,) = self._slopes[None](values | self._leaves(entries, x) | moves)
+        (found,) = self._slopes[None]({**values, **self._leaves(entries, x), **moves})
         return self._by_number(found, n, len(x))
 
     def prepare(self, name: str) -> None:
@@ -227,7 +227,9 @@ class PickedLook:
         value = values[name]
         size = math.prod(value.shape[1:])
         unit = np.eye(size).reshape(size, 1, *value.shape[1:])
-        (found,) = self._slopes[name](values | self._leaves(entries, x) | {f"move of {name}": unit})
+        (found,) = self._slopes[name](
+            {**values, **self._leaves(entries, x), f"move of {name}": unit}
+        )
         return self._by_number(found, size, len(x))
 
     # ---- private -------------------------------------------------------------------------------
