@@ -8,7 +8,16 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import Explanation, explain, filter, forecast, infer, most_likely, smooth
+from bayesmc.auto import (
+    Explanation,
+    explain,
+    filter,
+    forecast,
+    infer,
+    most_likely,
+    prior_predict,
+    smooth,
+)
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
@@ -72,7 +81,7 @@ from bayesmc.engines.weighted.rejection import Rejection
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
-from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
+from bayesmc.results import Elpd, Marginal, Posterior, SeriesPosterior, Summary, compare
 from bayesmc.structure.log_density import log_density
 
 if TYPE_CHECKING:
@@ -95,6 +104,7 @@ __all__ = [
     "DiscreteFilter",
     "DiscreteUniform",
     "DynamicBayesNet",
+    "Elpd",
     "Distribution",
     "Exact",
     "ExpectationPropagation",
@@ -153,6 +163,7 @@ __all__ = [
     "Weibull",
     "Wishart",
     "WrappedNormal",
+    "compare",
     "errors",
     "explain",
     "filter",
@@ -164,6 +175,7 @@ __all__ = [
     "markov",
     "montecarlo",
     "most_likely",
+    "prior_predict",
     "smooth",
     "stack",
 ]

@@ -12,6 +12,7 @@ import numpy as np
 from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
+from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
@@ -19,6 +20,7 @@ from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import is_worth_it, without_tables
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.paths import Paths, forecast_from
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
 from bayesmc.randomness import seed_sequence
@@ -161,12 +163,14 @@ def smooth(
             f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
         )
     options |= {"lag": lag, "queries": queries, "progress": progress}
-    return chosen.smooth(problem, seed_sequence(rng), **options)
+    found = chosen.smooth(problem, seed_sequence(rng), **options)
+    found.paths = Paths(problem, observations, inputs)
+    return found
 
 
 def forecast(
-    dbn: DynamicBayesNet,
-    observations: Mapping[str, Any],
+    dbn: DynamicBayesNet | OnlineBelief,
+    observations: Mapping[str, Any] | None = None,
     *,
     steps: int,
     inputs: Mapping[str, Any] | None = None,
@@ -179,6 +183,13 @@ def forecast(
 
     ``inputs`` have rows for those slices, too. Other parameters and errors are those of ``filter``.
 
+    Parameters
+    ----------
+    dbn : DynamicBayesNet or belief
+        A belief, which ``engine.step`` returned, goes on from its slice: it comes with the ``engine`` that
+        made it and without observations, and ``inputs`` have rows for the slices ahead alone.
+    steps : int
+
     Examples
     --------
     >>> import bayesmc as bmc
@@ -188,10 +199,18 @@ def forecast(
     [1.0, 0.5, 0.25]
     """
     check_steps("forecast", steps)
+    if isinstance(dbn, OnlineBelief):
+        return _from_belief(dbn, observations, steps, inputs, engine, queries)
+    if observations is None:
+        raise TypeError(
+            "forecast: give the observations so far, or a belief in place of the template"
+        )
     problem = pose_series(dbn, observations, inputs, ahead=steps)
     chosen = _engine(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
-    return chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+    found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+    found.paths = Paths(problem, observations, inputs)
+    return found
 
 
 def most_likely(
@@ -344,6 +363,20 @@ def _instead(
     option = f"keep={asked.keep!r}" if asked.keep is not None else f"queries={list(asked.queries)}"
     name = type(displaced).__name__
     return f"{option} has {type(chosen).__name__} answer where {name} would without it ({refused[name]})"
+
+
+def _from_belief(
+    belief: OnlineBelief, observations: Any, steps: int, inputs: Any, engine: Any, queries: Any
+) -> SeriesPosterior:
+    if observations is not None:
+        raise TypeError(
+            "forecast: a belief has absorbed its rows already; leave observations out, or take in more rows "
+            "with engine.step(belief, row)"
+        )
+    if engine is None:
+        raise TypeError("forecast: give engine=, the one whose step returned the belief")
+    asked = read_queries("forecast", queries)
+    return forecast_from(_checked(engine), belief, steps, inputs, asked)
 
 
 def _why_not(engine: FilterEngine, problem: SeriesProblem, asked: Asked) -> str | None:

@@ -15,7 +15,11 @@ from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
+from bayesmc.results.assessed import Assessed
+from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal import Marginal
+from bayesmc.results.marginal_answers import MarginalAnswers
+from bayesmc.results.over_time import expanded, take_templates
 from bayesmc.results.query import Query
 from bayesmc.results.table import Summary
 
@@ -36,7 +40,8 @@ def quantile_levels(name: str, q: Any) -> np.ndarray:
     return levels
 
 
-class Posterior:
+@take_templates
+class Posterior(Assessed, MarginalAnswers):
     """Answers about the nodes of a net given evidence.
 
     Attributes
@@ -67,6 +72,11 @@ class Posterior:
     log_weights: np.ndarray | None = None
     weight_ess: float | None = None
     pareto_k: float | None = None
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Answers about one node take a template's node, too: all its slices, stacked (``over_time``)."""
+        super().__init_subclass__(**options)
+        take_templates(cls)
 
     def __init__(self, problem: Problem, engine: Any) -> None:
         self.problem: Problem | None = problem
@@ -203,6 +213,13 @@ class Posterior:
 
     # ---- what a posterior of its own kind knows of a node, by name, or of a query ----------------
 
+    def _laws(self, name: str) -> Laws:
+        node = self._node(name)
+        if node.domain is None or node.event_shape:
+            raise self._cannot(f"hdi, mode, cdf and entropy of {name!r}")
+        numbers = None if _is_labelled(node) else np.asarray(node.domain.numbers, dtype=float)
+        return TableLaws(self.probabilities(name), numbers, name)
+
     def _averaged(self, query: Query) -> np.ndarray:
         raise self._cannot("probability" if query.is_event else "expectation")
 
@@ -232,7 +249,8 @@ class Posterior:
 
         By default the nodes that are not wholly observed.
         """
-        chosen = list(names) if names is not None else [n for n in self.names if self._is_free(n)]
+        free = [n for n in self.names if self._is_free(n)]
+        chosen = expanded(self.model, names) if names is not None else free
         labels: list[str] = []
         parts: dict[str, list[np.ndarray]] = {}
         for name in chosen:
@@ -373,6 +391,14 @@ def table_variance(table: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Variances of numbers under tables of probabilities, shape ``table.shape[:-1]``."""
     centred = numbers - (table @ numbers)[..., None]
     return (table * centred**2).sum(axis=-1)
+
+
+def table_quantile(table: np.ndarray, numbers: np.ndarray, levels: np.ndarray) -> np.ndarray:
+    """Quantiles of numbers under tables of probabilities, shape ``(*levels.shape, *table.shape[:-1])``."""
+    order = np.argsort(numbers)
+    below = np.cumsum(table[..., order], axis=-1)
+    reach = below >= levels.reshape(levels.shape + (1,) * below.ndim) - 1e-12
+    return numbers[order][np.argmax(reach, axis=-1)]
 
 
 def near(angles: np.ndarray, mean: Any) -> np.ndarray:
