@@ -272,6 +272,24 @@ def explained_series(
     return Explanation(checked, reasons, {type(checked).__name__: why})
 
 
+def evidence_engine(problem: SeriesProblem, engine: FilterEngine | None) -> FilterEngine:
+    """The engine that tells the log evidence of a series without random error.
+
+    Raises
+    ------
+    UnsupportedError
+        It draws at random, gives no evidence, or no such engine takes the model.
+    """
+    chosen = _engine(problem, engine, Asked("filter"))
+    if isinstance(chosen, ParticleFilter):
+        raise UnsupportedError(
+            "fit: the evidence by a ParticleFilter has a random error, and a climb would follow it; infer the static "
+            "nodes with engine=ParticleMetropolis(draws), or take a deterministic filter (engine=GridFilter(), "
+            "UnscentedKalmanFilter(), SwitchingKalmanFilter())"
+        )
+    return chosen
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
