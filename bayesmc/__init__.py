@@ -78,6 +78,7 @@ from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
+from bayesmc.learning import Fit, fit
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
@@ -113,6 +114,7 @@ __all__ = [
     "ExtendedKalmanFilter",
     "FactorGraph",
     "FactoredFrontier",
+    "Fit",
     "Gamma",
     "Geometric",
     "GridFilter",
@@ -167,6 +169,7 @@ __all__ = [
     "errors",
     "explain",
     "filter",
+    "fit",
     "forecast",
     "infer",
     "io",

@@ -283,8 +283,10 @@ def evidence_engine(problem: SeriesProblem, engine: FilterEngine | None) -> Filt
     chosen = _engine(problem, engine, Asked("filter"))
     if isinstance(chosen, ParticleFilter):
         raise UnsupportedError(
-            "fit: the evidence by a ParticleFilter has a random error, and a climb would follow it; infer the static "
-            "nodes with engine=ParticleMetropolis(draws), or take a deterministic filter (engine=GridFilter(), "
+            "fit: the evidence by a ParticleFilter has a random error, and a climb would follow it; "
+            "infer the static "
+            "nodes with engine=ParticleMetropolis(draws), or take a deterministic filter "
+            "(engine=GridFilter(), "
             "UnscentedKalmanFilter(), SwitchingKalmanFilter())"
         )
     return chosen

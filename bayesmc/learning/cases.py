@@ -1,7 +1,7 @@
-"""Expected counts of families over cases of a net of tables: what is hidden in a case falls apart into components.
+"""Expected counts of families over cases of a net of tables: what is hidden falls apart into components.
 
-Given what a case shows, hidden nodes that share no family are independent. So each set of hidden nodes that hang
-together is summed over by itself, once for every configuration of what surrounds it, for all cases that
+Given what a case shows, hidden nodes that share no family are independent. So each set of hidden nodes that
+hang together is summed over by itself, once for every configuration of what surrounds it, for all cases that
 show the same at once. Families that a case shows in full are counted once and for all.
 """
 
@@ -52,7 +52,7 @@ class Part:
 
 
 class Step(NamedTuple):
-    """One node summed out: of which factors (those of the parts first, then earlier results), on what axis."""
+    """One node summed out: of which factors (the parts', then earlier results), on what axis."""
 
     axis: int
     factors: tuple[int, ...]
@@ -111,9 +111,7 @@ class Cases:
     ) -> None:
         self.names, self.cards = tuple(names), tuple(cards)
         at = {name: k for k, name in enumerate(names)}
-        self.families = tuple(
-            Family(n, (*(at[p] for p in parents[n]), at[n])) for n in self.names
-        )
+        self.families = tuple(Family(n, (*(at[p] for p in parents[n]), at[n])) for n in self.names)
         rows, inverse = np.unique(codes, axis=0, return_inverse=True)
         given = np.ones(len(codes)) if weights is None else np.asarray(weights, dtype=float)
         self.rows = rows
@@ -181,9 +179,7 @@ class Cases:
                 self._count(counts[part.family.name], part, part.shown[chosen], factor * slope)
         return float(weights @ np.log(mass))
 
-    def _factor(
-        self, part: Part, chosen: slice, tables: Mapping[str, np.ndarray]
-    ) -> np.ndarray:
+    def _factor(self, part: Part, chosen: slice, tables: Mapping[str, np.ndarray]) -> np.ndarray:
         if part.family is None:
             states = math.prod(part.shape)
             allowed = np.vstack([np.eye(states), np.ones(states)])  # the last row: whatever
@@ -292,14 +288,16 @@ class Cases:
         if size > _MOST:
             names = ", ".join(repr(self.names[k]) for k in hidden[:6])
             raise BudgetError(
-                f"fit: {len(hidden)} nodes that are hidden together ({names}, ...) take tables of {size:.3g} entries; "
+                f"fit: {len(hidden)} nodes that are hidden together ({names}, ...) take tables of "
+                f"{size:.3g} entries; "
                 "give data of some of them, or learn a template (DynamicBayesNet) where they form a chain"
             )
         return Component(hidden, weights, tuple(parts), steps, size, entries)
 
     def _impossible(self, why: str) -> ZeroProbabilityError:
         return ZeroProbabilityError(
-            f"fit: a case has probability zero: {why}; start EM from tables without zeros (start=), or add counts="
+            f"fit: a case has probability zero: {why}; start EM from tables without zeros (start=), "
+            "or add counts="
         )
 
 
@@ -361,7 +359,7 @@ def _backwards(
     weights: np.ndarray,
     spare: Container[int],
 ) -> list[np.ndarray]:
-    """Derivatives of the last factor by each but those to spare, times weights, from the last step to the first.
+    """Derivatives of the last factor by each but those to spare, times weights.
 
     Of a factor that all configurations share it is the sum over these.
     """

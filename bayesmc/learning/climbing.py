@@ -1,4 +1,4 @@
-"""From starts to the highest maximum, and how sharp it is: quasi-Newton steps, then the curvature by differences."""
+"""From starts to the highest maximum, and how sharp it is: quasi-Newton steps, then the curvature."""
 
 from __future__ import annotations
 
@@ -63,7 +63,8 @@ def maximum(
         refused = getattr(objective, "refused", None)
         why = f": {refused}" if refused is not None else ""
         raise UnsupportedError(
-            f"fit: the data have no probability at any of {len(heights)} starts{why}; give start= values that "
+            f"fit: the data have no probability at any of {len(heights)} starts{why}; give start= "
+            "values that "
             "explain them"
         )
     best: tuple[np.ndarray, float, np.ndarray, int] | None = None

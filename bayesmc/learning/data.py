@@ -23,6 +23,7 @@ def columns_of(data: Any) -> dict[str, Any]:
     if columns is not None and hasattr(data, "__getitem__"):
         return {str(name): data[name] for name in columns}
     raise EvidenceError(
-        f"fit: data are a {type(data).__name__}; give a dict from name to values, or a data frame with a column for "
+        f"fit: data are a {type(data).__name__}; give a dict from name to values, or a data frame "
+        "with a column for "
         "each node"
     )

@@ -65,9 +65,7 @@ def maximised(
             converged = True
             break
     errors = _errors(expected, tables, counts)
-    return Learned(
-        tables, log_likelihood, history[-1], np.array(history), converged, errors
-    )
+    return Learned(tables, log_likelihood, history[-1], np.array(history), converged, errors)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -56,12 +56,12 @@ def fit(
     ----------
     net : BayesNet or DynamicBayesNet
     data : dict or DataFrame
-        As ``infer`` and ``filter`` take evidence; for tables of a net one column for each node, with one entry
-        for each case (None, NaN or a masked entry is missing).
+        As ``infer`` and ``filter`` take evidence; for tables of a net one column for each node, with one
+        entry for each case (None, NaN or a masked entry is missing).
     inputs : dict, optional
     learn : str or sequence of str, optional
-        Names of nodes, or of tables, to learn; None as said above; ``"tables"`` all tables. Other hidden nodes
-        stay random.
+        Names of nodes, or of tables, to learn; None as said above; ``"tables"`` all tables. Other hidden
+        nodes stay random.
     prior : bool
         Maximise the posterior density, in the nodes' own coordinates, in place of the likelihood.
     counts : float or dict
@@ -81,7 +81,8 @@ def fit(
     Returns
     -------
     Fit
-        ``net`` (with what was learned in place), ``values``, ``std_errors``, ``log_likelihood``, ``summary()``.
+        ``net`` (with what was learned in place), ``values``, ``std_errors``, ``log_likelihood``,
+        ``summary()``.
 
     Raises
     ------
@@ -96,8 +97,8 @@ def fit(
 
     Notes
     -----
-    Nodes are found by quasi-Newton steps on the log evidence in unconstrained coordinates, with the gradient of
-    the expression graph where everything else hidden is finite, and by differences of exact evidences
+    Nodes are found by quasi-Newton steps on the log evidence in unconstrained coordinates, with the gradient
+    of the expression graph where everything else hidden is finite, and by differences of exact evidences
     elsewhere; standard errors are those of the observed information. Tables are found by expectation-
     maximisation, whose objective never falls.
 
@@ -125,8 +126,10 @@ def fit(
         if len(tables) < len(chosen):
             other = next(n for n in chosen if n not in tables)
             raise UnsupportedError(
-                f"fit: {tables[0]!r} is a table and {other!r} a node with a prior, and one call learns either; give "
-                "the table's rows a Dirichlet prior as a node, Categorical(rows[parent]), or learn one after the "
+                f"fit: {tables[0]!r} is a table and {other!r} a node with a prior, and one call "
+                "learns either; give "
+                "the table's rows a Dirichlet prior as a node, Categorical(rows[parent]), or learn "
+                "one after the "
                 "other (learn=)"
             )
         return fit_tables(net, data, inputs, tables, counts, start or {}, tolerance, max_iterations)
@@ -156,23 +159,31 @@ def _chosen(
         names = (learn,) if isinstance(learn, str) else tuple(learn)
         for name in names:
             if name not in declared:
-                raise ModelError(f"fit: learn= names {name!r}, which is no node{did_you_mean(name, declared)}")
+                raise ModelError(
+                    f"fit: learn= names {name!r}, which is no node{did_you_mean(name, declared)}"
+                )
             if name in data and not _is_table(net, name):
-                raise ModelError(f"fit: {name!r} is to be learned, and the data have it; leave out one of both")
+                raise ModelError(
+                    f"fit: {name!r} is to be learned, and the data have it; leave out one of both"
+                )
         if not names:
             raise ModelError("fit: learn= names nothing; leave it out, or name nodes")
         return names
-    nodes = _static_nodes(net, data) if isinstance(net, DynamicBayesNet) else _roots(net, data, inputs)
+    nodes = (
+        _static_nodes(net, data) if isinstance(net, DynamicBayesNet) else _roots(net, data, inputs)
+    )
     if nodes and tables and isinstance(net, DynamicBayesNet):
         known = ", ".join(map(repr, nodes))
         raise ModelError(
-            f"fit: there are nodes to be learned ({known}) and tables ({', '.join(map(repr, tables))}); say which with "
+            f"fit: there are nodes to be learned ({known}) and tables "
+            f"({', '.join(map(repr, tables))}); say which with "
             f'learn=[...] or learn="tables"; tables that are known stay as they are'
         )
     found = nodes or tables
     if not found:
         raise ModelError(
-            "fit: there is nothing to learn: no hidden node that reads no other (a parameter with a prior), and no "
+            "fit: there is nothing to learn: no hidden node that reads no other (a parameter with a "
+            "prior), and no "
             "table; name what is to be learned with learn=, or ask for posteriors with infer"
         )
     return found
@@ -181,9 +192,7 @@ def _chosen(
 def _static_nodes(dbn: DynamicBayesNet, data: Mapping[str, Any]) -> tuple[str, ...]:
     model = pose_series(dbn, data).model if not dbn.inputs else None
     return tuple(
-        n
-        for n in dbn.static_nodes
-        if n not in data and (model is None or model[n].is_stochastic)
+        n for n in dbn.static_nodes if n not in data and (model is None or model[n].is_stochastic)
     )
 
 
@@ -226,7 +235,12 @@ def _objective(
 
 
 def _by_elimination(
-    net: BayesNet, data: Mapping[str, Any], inputs: Any, unknowns: Unknowns, prior: bool, others: list[str]
+    net: BayesNet,
+    data: Mapping[str, Any],
+    inputs: Any,
+    unknowns: Unknowns,
+    prior: bool,
+    others: list[str],
 ) -> Evidence:
     """Other hidden numbers are integrated out by exact elimination, given the unknowns."""
     exact, seed = Exact(), np.random.SeedSequence(0)
@@ -238,7 +252,8 @@ def _by_elimination(
     refused = exact.refusal(asked(first))
     if refused is not None:
         raise UnsupportedError(
-            f"fit: besides what is learned {', '.join(map(repr, others[:4]))} is hidden, and must be integrated out: "
+            f"fit: besides what is learned {', '.join(map(repr, others[:4]))} is hidden, and must be "
+            "integrated out: "
             f"{refused}; name it in learn= (it is then learned, too), or infer the posterior of all"
         )
 
@@ -265,7 +280,8 @@ def _of_template(
     left = [n for n in problem.unknown_static if n not in names]
     if left:
         raise UnsupportedError(
-            f"fit: the static node {left[0]!r} is neither learned nor observed; name it in learn=, or observe it"
+            f"fit: the static node {left[0]!r} is neither learned nor observed; name it in learn=, or "
+            "observe it"
         )
     unknowns = Unknowns.of(problem.model, names, {})
     first = unknowns.values(unknowns.starts(1, np.random.default_rng(0))[0])
@@ -283,12 +299,12 @@ def _of_template(
     return Evidence(unknowns, log_evidence, prior), unknowns
 
 
-def _starts(
-    unknowns: Unknowns, start: Mapping[str, Any], rng: np.random.Generator
-) -> np.ndarray:
+def _starts(unknowns: Unknowns, start: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
     for name in start:
         if name not in unknowns.names:
-            raise ModelError(f"fit: start= names {name!r}, which is not learned: {list(unknowns.names)}")
+            raise ModelError(
+                f"fit: start= names {name!r}, which is not learned: {list(unknowns.names)}"
+            )
     drawn = unknowns.starts(_STARTS, rng)
     if not start:
         return drawn
@@ -313,9 +329,12 @@ def _fitted(
         at += value.size
     if not found.converged:
         flat = [x for x, e in zip(unknowns.labels(), spread, strict=True) if not np.isfinite(e)]
-        told = f" the data do not tell {', '.join(flat[:4])}, or it lies at an edge:" if flat else ""
+        told = (
+            f" the data do not tell {', '.join(flat[:4])}, or it lies at an edge:" if flat else ""
+        )
         warnings.warn(
-            f"fit: the climb ended after {found.steps} steps before a maximum:{told} look at history, give start=, or "
+            f"fit: the climb ended after {found.steps} steps before a maximum:{told} look at history, "
+            "give start=, or "
             "use prior=True with priors that say more",
             ConvergenceWarning,
             stacklevel=3,
@@ -348,6 +367,7 @@ def _covariance(unknowns: Unknowns, found: Maximum) -> np.ndarray:
         spread = np.where(np.isnan(covariance), 0.0, covariance)
         result = jacobian @ spread @ jacobian.T
         lost = (np.abs(jacobian) > 0) @ np.isnan(np.diagonal(covariance))
+    lost |= np.abs(jacobian).max(axis=1) < 1e-9  # at the edge for good
     result[lost], result[:, lost] = np.nan, np.nan
     return result
 

@@ -24,9 +24,9 @@ class Fit:
         Node -> estimate, shape ``(*plates, *event)``; of tables probabilities, the parents' axes first (the
         initial ones of a template's node ``x`` under ``"x initial"``).
     std_errors : dict
-        Node -> standard error of every number, from the curvature of the log likelihood (of the log posterior,
-        with ``prior=True``) at the maximum; NaN where a number lies at the edge of its support or the data do
-        not tell it.
+        Node -> standard error of every number, from the curvature of the log likelihood (of the log
+        posterior, with ``prior=True``) at the maximum; NaN where a number lies at the edge of its support or
+        the data do not tell it.
     log_likelihood : float
         Of the data at the estimates, everything hidden summed out.
     objective : float
@@ -83,9 +83,8 @@ class Fit:
 
     def _title(self) -> str:
         how = "converged" if self.converged else "NOT converged"
-        return (
-            f"{self.method}: log likelihood {self.log_likelihood:.4f}, {how} after {self.iterations} iterations"
-        )
+        told = f"log likelihood {self.log_likelihood:.4f}, {how} after {self.iterations} iterations"
+        return f"{self.method}: {told}"
 
     def __repr__(self) -> str:
         return f"Fit({', '.join(self.values)}; {self._title()})"

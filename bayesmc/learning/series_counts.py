@@ -1,4 +1,4 @@
-"""Expected counts of a template's tables over a series: pairs of slices, slices, and where neither tells, all at once."""
+"""Expected counts of a template's tables over a series: by slices, by pairs of them, or all at once."""
 
 from __future__ import annotations
 
@@ -79,9 +79,7 @@ class SeriesCounts:
         )
         return other
 
-    def expected(
-        self, tables: Mapping[str, np.ndarray]
-    ) -> tuple[float, Mapping[str, np.ndarray]]:
+    def expected(self, tables: Mapping[str, np.ndarray]) -> tuple[float, Mapping[str, np.ndarray]]:
         """The log likelihood of the series, and the expected count of every entry."""
         dbn = self.filled(tables)
         problem = pose_series(dbn, self.data, self.inputs)
@@ -127,7 +125,8 @@ class _Slices:
             return joint.reshape(-1, *shape).sum(axis=0)
         if own.plates:
             raise UnsupportedError(
-                f"fit: the table of {name!r} has plates and reads {parents}; in plates tables are learned that read "
+                f"fit: the table of {name!r} has plates and reads {parents}; in plates tables are "
+                "learned that read "
                 "their own slice, or their own value in the one before"
             )
         return self._at_once((*parents, name)).reshape(shape)
@@ -145,8 +144,10 @@ class _Slices:
         plates = self.owner.model[names[-1]].plates
         if any(self.owner.model[n].plates != plates for n in names):
             raise UnsupportedError(
-                f"fit: the table of {names[-1]!r} reads nodes in other plates than its own; such tables are not learned"
+                f"fit: the table of {names[-1]!r} reads nodes in other plates than its own; such "
+                "tables are not learned"
             )
+
         def joint(*values: Any) -> np.ndarray:
             total: Any = 1.0
             for k, (value, own) in enumerate(zip(values, states, strict=True)):
@@ -164,7 +165,9 @@ class _Slices:
     def _at_once(self, names: tuple[str, ...]) -> np.ndarray:
         """Sums of joint tables over pairs of slices, from the exact posterior of all slices."""
         if self._unrolled is None:
-            self._unrolled = infer(self.dbn, self.owner.data, inputs=self.owner.inputs, engine=Exact())
+            self._unrolled = infer(
+                self.dbn, self.owner.data, inputs=self.owner.inputs, engine=Exact()
+            )
         total: Any = 0.0
         for t in range(1, self.owner.steps):
             rows = [

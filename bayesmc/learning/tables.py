@@ -1,4 +1,4 @@
-"""Tables of a net learned from cases, and of a template from its series: what is read, and what comes back."""
+"""Tables of a net learned from cases, of a template from its series: what is read, what comes back."""
 
 from __future__ import annotations
 
@@ -39,9 +39,7 @@ def fit_tables(
         series = SeriesCounts(net, data, inputs, learned)
         begin = {n: _begin(n, t, start) for n, t in series.tables().items()}
         _check_names(start, begin)
-        found = maximised(
-            series.expected, begin, _dirichlet(begin, counts), tolerance, most
-        )
+        found = maximised(series.expected, begin, _dirichlet(begin, counts), tolerance, most)
         return _fit(series.filled(found.tables), found, counts)
     if inputs:
         raise UnsupportedError("fit: tables are learned of nets without inputs; leave inputs= out")
@@ -49,11 +47,14 @@ def fit_tables(
     _check_net(net, model, learned)
     names = [n for n, node in model.nodes.items() if node.is_stochastic]
     if not data:
-        raise EvidenceError("fit: there are no data; give a column for each node, with one entry for each case")
+        raise EvidenceError(
+            "fit: there are no data; give a column for each node, with one entry for each case"
+        )
     for name in data:
         if name not in model.nodes:
             raise EvidenceError(
-                f"fit: the data have a column {name!r}, which is no node{did_you_mean(name, model.nodes)}; drop it, or "
+                f"fit: the data have a column {name!r}, which is no "
+                f"node{did_you_mean(name, model.nodes)}; drop it, or "
                 "rename it"
             )
     columns = {n: _codes(model[n], data[n]) for n in names if n in data}
@@ -92,12 +93,16 @@ def fit_tables(
 def _fit(filled: Any, found: Learned, counts: Any) -> Fit:
     if not found.converged:
         warnings.warn(
-            f"fit: EM still rose by {found.history[-1] - found.history[-2]:.3g} nats in its last iteration; give more "
+            f"fit: EM still rose by {found.history[-1] - found.history[-2]:.3g} nats in its last "
+            "iteration; give more "
             "max_iterations=",
             ConvergenceWarning,
             stacklevel=4,
         )
-    added = any(np.any(np.asarray(c) > 0) for c in (counts.values() if isinstance(counts, Mapping) else [counts]))
+    added = any(
+        np.any(np.asarray(c) > 0)
+        for c in (counts.values() if isinstance(counts, Mapping) else [counts])
+    )
     how = "EM, posterior mode" if added else "EM, maximum likelihood"
     return Fit(
         filled, found.tables, found.errors, found.log_likelihood, found.objective, found.history,
@@ -107,16 +112,20 @@ def _fit(filled: Any, found: Learned, counts: Any) -> Fit:
 
 def _check_net(net: BayesNet, model: Model, learned: Sequence[str]) -> None:
     if net.potentials:
-        raise UnsupportedError("fit: a net with potentials is not normalised; tables are learned of nets without")
+        raise UnsupportedError(
+            "fit: a net with potentials is not normalised; tables are learned of nets without"
+        )
     for name, node in model.nodes.items():
         if node.kind != "stochastic":
             raise UnsupportedError(
-                f"fit: node {name!r} is {node.kind}; tables are learned of nets whose nodes are random and finite"
+                f"fit: node {name!r} is {node.kind}; tables are learned of nets whose nodes are "
+                "random and finite"
             )
         if node.domain is None or node.event_shape or node.plates:
             what = "has plates" if node.plates else "has no finite states"
             raise UnsupportedError(
-                f"fit: node {name!r} {what}; tables are learned of nets that describe one case by finite nodes, from "
+                f"fit: node {name!r} {what}; tables are learned of nets that describe one case by "
+                "finite nodes, from "
                 "data with one row for each case. Of other nets declare what is unknown as nodes with priors"
             )
 
@@ -146,14 +155,20 @@ def _codes(node: CompiledNode, column: Any) -> np.ndarray:
         raise EvidenceError(
             f"fit: column {node.name!r} has shape {values.shape}; give one entry for each case"
         )
-    missing = np.ma.getmaskarray(values) if isinstance(values, np.ma.MaskedArray) else np.zeros(len(values), bool)
+    missing = (
+        np.ma.getmaskarray(values)
+        if isinstance(values, np.ma.MaskedArray)
+        else np.zeros(len(values), bool)
+    )
     plain = np.asarray(values)
     missing = missing | (plain != plain) | np.array([v is None for v in plain.tolist()], dtype=bool)
     states = {_plain(s): k for k, s in enumerate(node.domain.states)}
     codes = np.full(len(plain), MISSING, dtype=np.int32)
     kept = plain[~missing]
     try:
-        found, inverse = np.unique(kept.astype(object).astype(str) if kept.dtype == object else kept, return_inverse=True)
+        found, inverse = np.unique(
+            kept.astype(object).astype(str) if kept.dtype == object else kept, return_inverse=True
+        )
     except TypeError as error:
         raise EvidenceError(f"fit: column {node.name!r}: {error}") from error
     texts = {str(s): k for s, k in states.items()}
@@ -163,7 +178,8 @@ def _codes(node: CompiledNode, column: Any) -> np.ndarray:
         if at is None:
             shown = ", ".join(map(repr, list(states)[:8]))
             raise EvidenceError(
-                f"fit: column {node.name!r} has {value!r}, which is no state{did_you_mean(str(value), map(str, states))}; "
+                f"fit: column {node.name!r} has {value!r}, which is no "
+                f"state{did_you_mean(str(value), map(str, states))}; "
                 f"its states are {shown}"
             )
         places[k] = at
@@ -186,7 +202,8 @@ def _begin(name: str, table: np.ndarray, start: Mapping[str, Any]) -> np.ndarray
     given = np.asarray(start[name], dtype=float)
     if given.shape != table.shape or not np.allclose(given.sum(axis=-1), 1.0) or (given < 0).any():
         raise ModelError(
-            f"fit: start of {name!r} has shape {given.shape}; give probabilities of shape {table.shape}, whose rows sum "
+            f"fit: start of {name!r} has shape {given.shape}; give probabilities of shape "
+            f"{table.shape}, whose rows sum "
             "to 1"
         )
     return given
@@ -206,7 +223,8 @@ def _dirichlet(tables: Tables, counts: Any) -> dict[str, np.ndarray]:
             own = np.broadcast_to(np.asarray(given.get(name, 0.0), dtype=float), table.shape)
         except (TypeError, ValueError):
             raise ModelError(
-                f"fit: counts of {name!r} do not fit its table of shape {table.shape}; give a number, or one for "
+                f"fit: counts of {name!r} do not fit its table of shape {table.shape}; give a number, "
+                "or one for "
                 "each entry"
             ) from None
         if not (own >= 0).all():

@@ -68,7 +68,8 @@ class Unknowns:
             node = model[name]
             if node.domain is not None or node.is_discrete or node.support is None:
                 raise UnsupportedError(
-                    f"fit: node {name!r} is discrete, and values of discrete nodes are not climbed to; leave it out "
+                    f"fit: node {name!r} is discrete, and values of discrete nodes are not climbed "
+                    "to; leave it out "
                     "of learn= (it is summed out), or declare its table, which is learned"
                 )
             transform = transform_of(node.support, node.event_shape)
@@ -103,7 +104,9 @@ class Unknowns:
         for p in self.parts:
             name = p.node.name
             try:
-                value = np.broadcast_to(np.asarray(store(p.node, values[name]), float), p.node.value_shape)
+                value = np.broadcast_to(
+                    np.asarray(store(p.node, values[name]), float), p.node.value_shape
+                )
             except (TypeError, ValueError) as error:
                 raise EvidenceError(f"fit: start of {name!r}: {error}") from error
             u = p.transform.unconstrain(value)

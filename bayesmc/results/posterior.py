@@ -7,6 +7,7 @@ comes about (from draws, from sums, from exact tables) is each subclass's own af
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -375,6 +376,13 @@ class Posterior(Assessed, MarginalAnswers):
 
     def __deepcopy__(self, memo: Any) -> Posterior:
         return self
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it: the summary, where there is one."""
+        try:
+            return self.summary()._repr_html_()
+        except UnsupportedError as error:
+            return f"<pre>{escape(repr(self))}\n{escape(str(error))}</pre>"
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"
