@@ -117,7 +117,7 @@ class Cases:
         self.rows = rows
         self.weights = np.bincount(inverse.ravel(), weights=given, minlength=len(rows))
         self.total = float(given.sum())
-        some = (self.rows < 0).any(axis=1)
+        some = np.asarray((self.rows < 0).any(axis=1))
         together = self._together(np.flatnonzero(some)) if some.any() else None
         many = len(np.unique(self.rows[some] < 0, axis=0))
         # one pass over all cases, or many small ones: by what either costs, a call being some 1,000 numbers
@@ -264,7 +264,7 @@ class Cases:
     ) -> Component:
         families = [self.families[k] for k in sorted({f for h in hidden for f in touching[h]})]
         around = sorted({a for f in families for a in f.axes} - set(hidden))
-        shown, inverse = np.unique(self.rows[np.ix_(rows, around)], axis=0, return_inverse=True)
+        shown, inverse = np.unique(self.rows[rows][:, around], axis=0, return_inverse=True)
         weights = np.bincount(inverse.ravel(), weights=self.weights[rows], minlength=len(shown))
         place = {column: k for k, column in enumerate(around)}
         parts = []
