@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.switching import REASON, settled_or_kim, why_too_long, within_budget
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
@@ -18,9 +19,10 @@ from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.marginal.options import is_worth_it, without_tables
+from bayesmc.engines.marginal.options import asking, is_worth_it
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.paths import Paths, forecast_from
+from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
 from bayesmc.randomness import seed_sequence
@@ -32,6 +34,7 @@ _CANDIDATES: tuple[type[FilterEngine], ...] = (
     BoyenKoller,
     KalmanFilter,
     GridFilter,
+    ExpectationPropagation,
     SwitchingKalmanFilter,
     ParticleFilter,
 )
@@ -39,8 +42,8 @@ _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "BoyenKoller": "all hidden nodes are finite, but too many for one joint state",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
-    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate "
-    "(smoothed, those of ExpectationPropagation mostly less)",
+    "ExpectationPropagation": REASON,
+    "SwitchingKalmanFilter": "hidden numbers are linear-Gaussian given finite nodes; answers are approximate",
     "ParticleFilter": "every hidden node can be sampled given its parents",
     "GridFilter": "hidden nodes are finite, angles, on bounded intervals, or the one number of a slice",
 }
@@ -126,6 +129,12 @@ def smooth(
 
     Other parameters and errors are those of ``filter``.
 
+    Warns
+    -----
+    EngineWarning
+        Where no engine is named and messages of ``ExpectationPropagation``, which switching systems are
+        smoothed by, do not come near to settling: then ``SwitchingKalmanFilter`` answers.
+
     Parameters
     ----------
     lag : int, optional
@@ -162,6 +171,10 @@ def smooth(
             f"smooth({name}={options[name]!r}): it says how particles are smoothed, and "
             f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
         )
+    if engine is None and isinstance(chosen, ExpectationPropagation):
+        found = settled_or_kim(chosen, problem, seed_sequence(rng), queries, progress)
+        found.paths = Paths(problem, observations, inputs)
+        return found
     options |= {"lag": lag, "queries": queries, "progress": progress}
     found = chosen.smooth(problem, seed_sequence(rng), **options)
     found.paths = Paths(problem, observations, inputs)
@@ -258,14 +271,14 @@ def explained_series(
     asked = Asked(question, keep, read_queries("explain", queries))
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
-        nodes = without_tables(chosen, question).describe(problem)
+        nodes = asking(chosen, question).describe(problem)
         return Explanation(
             chosen, reasons, refused, nodes, effort=chosen.effort_for(problem, asked)
         )
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
     if why is None:
-        teller = without_tables(checked, question)
+        teller = asking(checked, question)
         nodes, effort = teller.describe(problem), teller.effort_for(problem, asked)
         return Explanation(checked, ("it was asked for",), {}, nodes, effort=effort)
     reasons = ("it was asked for, but it cannot answer",)
@@ -335,6 +348,8 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
         engine, name = _made(candidate, problem, asked), candidate.__name__
         if isinstance(engine, BoyenKoller) and not DiscreteFilter().is_out_of_room(problem):
             continue  # it has nothing to say that an exact filter does not
+        if isinstance(engine, ExpectationPropagation) and asked.what != "smooth":
+            continue  # its first pass forward is the switching filter's
         reason = engine.refusal(problem)
         if reason is None:
             reason = engine.unable(problem, asked)
@@ -344,11 +359,13 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
             reason = f"it would not answer for {', '.join(map(repr, silent))}"
         if reason is None:
             reason = engine.unasked(problem, asked)
+            if reason is None and isinstance(engine, ExpectationPropagation):
+                reason = why_too_long(engine, problem)
             if reason is not None:
                 late.append(engine)
         if reason is None:
             instead = _instead(engine, displaced, asked, refused)
-            why = without_tables(engine, asked.what).reasons(problem) or (_WHY[name],)
+            why = asking(engine, asked.what).reasons(problem) or (_WHY[name],)
             return _Chosen(engine, why if instead is None else (*why, instead), refused, instead)
         refused[name] = reason
     if late:  # nothing that is better can answer
@@ -367,10 +384,12 @@ def _made(candidate: type[FilterEngine], problem: SeriesProblem, asked: Asked) -
     if candidate is ParticleFilter and common_refusal(ParticleFilter(), problem) is None:
         engine = ParticleFilter(marginalize="auto")
         if (
-            is_worth_it(without_tables(engine, asked.what), problem)
+            is_worth_it(asking(engine, asked.what), problem)
             and _why_not(engine, problem, asked) is None
         ):
             return engine
+    if candidate is ExpectationPropagation and asked.what == "smooth":
+        return within_budget(problem)
     return candidate()
 
 

@@ -213,13 +213,13 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
         every = np.repeat(mean[:, None], levels.size, axis=1)
         return every.reshape((len(mean), *levels.shape, *mean.shape[1:]))
 
-    def mcse(self, what: Any) -> np.ndarray:
+    def mcse(self, what: Any) -> Any:
         """Monte Carlo standard errors of ``mean(name)``, time first; of each probability, for labels.
 
-        Answers that nothing was drawn for have none: 0. What a filter leaves out by its assumptions (an
-        extended Kalman filter's tangents, say) is no part of it. Those of particles come from the families
-        of particles of earlier slices, those of trajectories drawn backwards from which of them share
-        particles (see ``ParticleFilter``); infinite where nobody can tell.
+        Exact answers have none: 0. Those of a filter that approximates and draws nothing (Gaussians that are
+        merged, clusters, tangents, a grid) have an error that is not of chance, and unknown: None. Those of
+        particles come from the families of particles of earlier slices, those of trajectories drawn backwards
+        from which of them share particles (see ``ParticleFilter``); infinite where nobody can tell.
 
         Raises
         ------
@@ -234,6 +234,8 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
         node = self._node(what)
         if self.mean_errors is not None and what in self.mean_errors:
             return self.mean_errors[what].copy()
+        if self.mean_errors is None and not getattr(self.engine, "is_exact", True):
+            return None
         labelled = node.domain is not None and node.domain.labels is not None
         return np.zeros(np.shape(self.probabilities(what) if labelled else self.mean(what)))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -80,12 +81,12 @@ def split_of_problem(engine: Any, problem: SeriesProblem) -> Split | None:
     return split_asked(engine, problem.slices, problem.known_static, problem.seen)
 
 
-def without_tables(engine: Any, what: str) -> Any:
-    """The same engine without tables of finite nodes where a question is about the past: they know none."""
+def asking(engine: Any, what: str) -> Any:
+    """The same engine as it answers a question about the past: it may integrate out less there."""
     if what not in PAST or getattr(engine, "marginalize", None) is None:
         return engine
     found = object.__new__(type(engine))
-    found.__dict__.update(engine.__dict__, tabled=False)
+    found.__dict__.update(engine.__dict__, question=what)
     return found
 
 
@@ -94,7 +95,7 @@ def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | Non
     if what not in PAST:
         return None
     try:
-        split_of_problem(without_tables(engine, what), problem)
+        split_of_problem(asking(engine, what), problem)
     except UnsupportedError as error:
         return f"ParticleFilter: {error}"
     return None
@@ -161,6 +162,20 @@ def is_worth_it(engine: Any, problem: SeriesProblem) -> bool:
     return bool(split.inner) or (split.tables is not None and split.tables.joint > FEW)
 
 
+def numbers_carried(engine: Any, problem: SeriesProblem) -> float:
+    """Of a particle: entries of its tables, and of the roots of its covariances."""
+    split = None if engine.marginalize is None else split_of_problem(engine, problem)
+    if split is None:
+        return 0.0
+    slices = problem.slices
+    sizes = [np.prod(slices.later[n].value_shape) for n in split.inner]
+    apart = math.prod(slices.first.sizes[p] for p in blocks_of(slices, split))
+    found = float(sum(sizes)) ** 2 / max(apart, 1)
+    if split.tables is not None:
+        found += sum(g.elements * g.states for g in split.tables.groups)
+    return found
+
+
 def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Why this engine is taken, where something is integrated out."""
     split = split_of_problem(engine, problem)
@@ -173,7 +188,7 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
 
 def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Computed nodes that keep trajectories from being drawn backwards: none that is integrated out."""
-    split = split_of_problem(without_tables(engine, PAST[0]), problem)
+    split = split_of_problem(asking(engine, PAST[0]), problem)
     if split is not None and why_not_backwards(problem.slices, split) is None:
         return ()
     return endless(problem.slices, problem.seen)
@@ -181,14 +196,17 @@ def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
 
 def back(engine: Any, problem: SeriesProblem, asked: Asked) -> str:
     """How smoothing is done, where something is integrated out."""
-    split = split_of_problem(without_tables(engine, asked.what), problem)
+    split = split_of_problem(asking(engine, asked.what), problem)
     if split is None or asked.what not in PAST:
         return ""
+    own = " and ".join(
+        ["a Kalman smoother"] * bool(split.inner) + ["smoothed tables"] * (split.tables is not None)
+    )
     if asked.what == "fixed-lag":
-        return "a Kalman smoother along the ancestors of each particle"
+        return f"{own} along the ancestors of each particle"
     why = why_not_backwards(problem.slices, split)
     if why is None:
-        return "paths of what is sampled drawn backwards, a Kalman smoother along each"
+        return f"paths of what is sampled drawn backwards, {own} along each"
     return f"trajectories of all nodes drawn backwards: nothing stays integrated out, as {why}"
 
 
@@ -243,5 +261,23 @@ def _whole(
 ) -> Split:
     """What is integrated out, though it be nothing."""
     known = frozenset(n for n in slices.stochastic if n in seen)
-    tabled = getattr(engine, "tabled", True) and not getattr(engine, "delay", None)
-    return split_of(slices, known, engine.marginalize, static, tabled)
+    what = "fixed-lag" if getattr(engine, "delay", None) else engine.question
+    found = split_of(slices, known, engine.marginalize, static)
+    why = _why_untabled(slices, found, what)
+    return found if why is None else split_of(slices, known, engine.marginalize, static, why)
+
+
+def _why_untabled(slices: Slices, split: Split, what: str) -> str | None:
+    """Why what is asked about the past is not answered from tables, or None."""
+    if split.tables is None or what not in PAST:
+        return None
+    if what == "smooth":
+        return why_not_backwards(slices, split)
+    late = split.waiting - frozenset(split.names)
+    if not late:
+        return None
+    name = next(n for n in slices.dynamic if n in late)
+    return (
+        f"{name!r} is computed from them, or missing, and what a particle has of it was drawn before later "
+        "rows came"
+    )

@@ -132,6 +132,9 @@ class MarginalStep(FilterStep):
         if self.tables is not None:
             known = self._known(row, before, values, selection)
             more, after, moves = self.tables.advanced(row, known, tables)
+            if self.lag and tables is not None:
+                pairs = [m.pair for m in moves if m.pair is not None]
+                after = after.looking_back(tables, pairs, self.lag)
             log = log if place.choices is not None else log + more
         found = self.weighted(row, values, log, selection)
         if not has_weight(found):

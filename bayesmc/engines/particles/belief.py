@@ -14,12 +14,12 @@ from bayesmc.dbn import DynamicBayesNet, Row, Slices, read_static
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.particles.answers import Answers, numbers_of
 from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.enough import COLLAPSED
 from bayesmc.engines.particles.errors import ByFamily, node_errors
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.lags import looked_back
-from bayesmc.engines.particles.options import COLLAPSED
 from bayesmc.engines.particles.smc import Bare, Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import LowEssWarning, QueryError, UnknownNodeError

@@ -22,30 +22,25 @@ from bayesmc.engines.particles.belief import (
 )
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_delay
+from bayesmc.engines.particles.enough import BUDGET, START, TOLERANCE, enough, price, warn_of_errors
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.lags import by_lag
 from bayesmc.engines.particles.layers import not_backwards
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
-    BUDGET,
     NOT_SMOOTHED,
-    START,
-    TOLERANCE,
     check_choice,
     check_count,
     check_kind,
     check_numbers,
     check_together,
     described,
-    enough,
     looks_told,
-    price,
     read_by,
     read_functions,
     refused,
     require_functions,
-    warn_of_errors,
     warn_of_what_is_not_guided,
     without_functions,
 )
@@ -200,6 +195,7 @@ class ParticleFilter(FilterEngine):
     tolerance: float = TOLERANCE
     compiled: bool | None = None
     budget: int = BUDGET
+    question: str = field(default="filter", init=False, repr=False, compare=False)
 
     label: ClassVar[str] = "particle filter"
     keeps: ClassVar[bool] = True
@@ -296,7 +292,7 @@ class ParticleFilter(FilterEngine):
                 found, filtered = by_lag(sized, problem, seed, self.delay, *whole, "filter")
         except KeyboardInterrupt as stop:
             found = filtered = answer_so_far(stop, self)
-        warn_of_errors(filtered, self)
+        warn_of_errors(filtered, self, marginal.numbers_carried(self, problem))
         warn_of_misfit(filtered.predictive, type(self).__name__, found.start, 3)
         return found
 
@@ -317,7 +313,7 @@ class ParticleFilter(FilterEngine):
         check_choice("backward", backward, "rejection", "exact", "smooth")
         if why := self.unable(problem, Asked("smooth" if lag is None else "fixed-lag")):
             raise UnsupportedError(why)
-        own: ParticleFilter = marginal.without_tables(self, "smooth")
+        own: ParticleFilter = marginal.asking(self, "smooth" if lag is None else "fixed-lag")
         if not own._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = own._sized(own._enough(problem, seed, lag is None, progress))
@@ -326,7 +322,7 @@ class ParticleFilter(FilterEngine):
         else:
             asked = Backwards(trajectories, backward == "rejection")
             found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
-        warn_of_errors(filtered, self)
+        warn_of_errors(filtered, self, marginal.numbers_carried(own, problem))
         warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
 
@@ -441,7 +437,7 @@ class ParticleFilter(FilterEngine):
 
         sizes = problem.slices.first.sizes
         slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
-        slices *= price(self)
+        slices *= price(self, marginal.numbers_carried(self, problem))
         return enough(tried, self.tolerance, slices, self.budget, keep)
 
     def _proposals(self, slices: Slices) -> SliceProposals:

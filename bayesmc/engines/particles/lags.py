@@ -98,6 +98,11 @@ def looked_back(
     found = lagged(window, step.layout, step.slices)
     if found.inner is None or len(window) == 1:
         return found
-    inner = found.inner.back(len(window) - 1)
-    drawn = inner.completed(stream(seed, Purpose.SMOOTH, found.t))
-    return found._replace(values=found.values | drawn, inner=inner)
+    inner, tables = found.inner.back(len(window) - 1), found.tables
+    rng = stream(seed, Purpose.SMOOTH, found.t)
+    drawn = inner.completed(rng)
+    if tables is not None:
+        tables = tables.back(len(window) - 1)
+        nodes = [step.slices.first[n] for g in tables.groups for n in g.names]
+        drawn |= tables.values(tables.drawn(rng), nodes)
+    return found._replace(values=found.values | drawn, inner=inner, tables=tables)
