@@ -202,12 +202,8 @@ class Cases:
         flat = posterior.reshape(len(shown), width)
         view = count.transpose(part.order)
         rows = math.prod(view.shape) // width
-        if width * len(shown) < 64 or rows == 1:
-            added = np.zeros((rows, width))
-            np.add.at(added, shown, flat)
-        else:
-            at = (shown[:, None] * width + np.arange(width)).ravel()
-            added = np.bincount(at, weights=flat.ravel(), minlength=rows * width)
+        at = (shown[:, None] * width + np.arange(width)).ravel()
+        added = np.bincount(at, weights=flat.ravel(), minlength=rows * width)
         view += added.reshape(view.shape)
 
     # ---- reading -------------------------------------------------------------------------------
