@@ -17,6 +17,7 @@ from bayesmc.auto import (
     infer_many,
     load,
     most_likely,
+    prior_predict,
     smooth,
 )
 from bayesmc.dbn import DynamicBayesNet
@@ -80,10 +81,11 @@ from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
+from bayesmc.learning import Fit, fit
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
-from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
+from bayesmc.results import Elpd, Marginal, Posterior, SeriesPosterior, Summary, compare
 from bayesmc.storage import CheckpointFile
 from bayesmc.structure.log_density import log_density
 
@@ -108,6 +110,7 @@ __all__ = [
     "DiscreteFilter",
     "DiscreteUniform",
     "DynamicBayesNet",
+    "Elpd",
     "Distribution",
     "Exact",
     "ExpectationPropagation",
@@ -116,6 +119,7 @@ __all__ = [
     "ExtendedKalmanFilter",
     "FactorGraph",
     "FactoredFrontier",
+    "Fit",
     "Gamma",
     "Geometric",
     "GridFilter",
@@ -167,9 +171,11 @@ __all__ = [
     "Weibull",
     "Wishart",
     "WrappedNormal",
+    "compare",
     "errors",
     "explain",
     "filter",
+    "fit",
     "forecast",
     "infer",
     "infer_many",
@@ -180,6 +186,7 @@ __all__ = [
     "markov",
     "montecarlo",
     "most_likely",
+    "prior_predict",
     "smooth",
     "stack",
 ]

@@ -26,6 +26,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "bayesmc"
 LAYERS = """
 __main__
 robotics | vision | plotting | io | testing
+learning
 auto
 pmcmc
 engines

@@ -1,6 +1,7 @@
 """Results: posteriors that answer the same queries whatever made them."""
 
 from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint
+from bayesmc.results.criteria import Elpd, compare
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
@@ -15,6 +16,7 @@ __all__ = [
     "ChainsSums",
     "Checkpoint",
     "DrawsPosterior",
+    "Elpd",
     "Marginal",
     "Posterior",
     "RunFile",
@@ -23,5 +25,6 @@ __all__ = [
     "Summary",
     "Sums",
     "SumsPosterior",
+    "compare",
     "save",
 ]

@@ -16,7 +16,13 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model, Problem
-from bayesmc.results.posterior import Posterior, circular_variance, table_variance
+from bayesmc.results.posterior import (
+    Posterior,
+    circular_variance,
+    quantile_levels,
+    table_quantile,
+    table_variance,
+)
 from bayesmc.results.running import Sums
 from bayesmc.results.shares import steps, weighted_share_count
 
@@ -72,6 +78,14 @@ class SumsPosterior(Posterior):
         self._finite(names[0])
         self._kept(names[0])
         return self._sums.counts(names[0])[0] / self._sums.weight[0]
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Of finite nodes, whose probabilities are summed; numbers are summed by their moments alone."""
+        node = self._numeric(name, "quantile")
+        levels = quantile_levels(name, q)
+        if node.domain is None:
+            raise self._cannot("quantile")
+        return table_quantile(self.probabilities(name), np.asarray(node.domain.numbers), levels)
 
     def _mcse(self, what: Any) -> np.ndarray:
         error = self._error(what)

@@ -359,11 +359,7 @@ class ChainEngine(Engine):
         return kept
 
     def _posterior(
-        self,
-        problem: Problem,
-        sampler: Sampler,
-        held: Kept | RunningChains,
-        loop: Loop,
+        self, problem: Problem, sampler: Sampler, held: Kept | RunningChains, loop: Loop
     ) -> ChainsPosterior | ChainsSums:
         checkpoint, lengths, warmup = loop.last.noted(problem), loop.lengths, loop.warmup
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}

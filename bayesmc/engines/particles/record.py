@@ -349,9 +349,7 @@ class FilteredParticles(SeriesPosterior):
 
     def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
         """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
-        if not callable(what):
-            return super().mcse(what)
-        return self._kept("mcse of a function").mcse(what)
+        return self._kept("mcse of a function").mcse(what) if callable(what) else super().mcse(what)
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
@@ -392,13 +390,14 @@ class FilteredParticles(SeriesPosterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
-        held = self._kept("quantile")
-        return held.quantile(self._node(name).name, q)
+        return self._kept("quantile").quantile(self._node(name).name, q)
+
+    def _held_laws(self, name: str) -> Any:
+        return self._kept("hdi, mode, cdf or entropy").laws(name)
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""
-        held = self._kept("cov")
-        return held.cov(*(self._node(name).name for name in names))
+        return self._kept("cov").cov(*(self._node(name).name for name in names))
 
     def _alike(self, what: str) -> Answers:
         """What is held, where each slice has as many particles."""
