@@ -70,6 +70,7 @@ from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
 from bayesmc.network import BayesNet, FactorGraph
+from bayesmc.objects import FrozenObject
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
@@ -103,6 +104,7 @@ __all__ = [
     "ExtendedKalmanFilter",
     "FactorGraph",
     "FactoredFrontier",
+    "FrozenObject",
     "Gamma",
     "Geometric",
     "GridFilter",

@@ -38,7 +38,7 @@ expression
 linalg
 resampling | gaussian | diagnostics | markov | plates | states | randomness | progress
 categorical
-errors | shapes
+errors | shapes | objects
 """
 DEPTH = {
     room.strip(): depth

@@ -179,7 +179,8 @@ def _compare_entries(
         at = tuple(i if n > 1 else 0 for i, n in zip(at, batch, strict=True))
         alone = _signature_at(node, entry(node, values, shape, full))
         if whole.family != alone.family or not all(
-            nearly_equal(a[at], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
+            nearly_equal(a[(*at, Ellipsis)], b)
+            for a, b in zip(whole.arrays, alone.arrays, strict=True)
         ):
             raise BroadcastError(_broadcast_message(node, at, whole, alone))
 
