@@ -29,15 +29,40 @@ def common_refusal(engine: Any, problem: SeriesProblem) -> str | None:
 
 
 def not_numbers(engine: Any, problem: SeriesProblem) -> str | None:
+    """Why an engine that computes with numbers does not take a template with objects, or None."""
+    objects = problem.objects
+    if not objects or getattr(engine, "keeps", False):  # it has particles
+        return None
+    who = engine if isinstance(engine, str) else type(engine).__name__
+    return (
         f"{who} computes with numbers, and node {objects[0]!r} holds objects; "
         "take ParticleFilter(particles)"
+    )
+
+
+def not_with_objects(engine: Any, problem: SeriesProblem) -> str | None:
+    """Why a particle filter with these options does not take a template with objects, or None."""
+    objects = problem.objects
+    if not objects:
+        return None
+    name = objects[0]
+    if engine.particles is None:
+        return (
+            f"ParticleFilter: nobody can tell beforehand what an object of node {name!r} takes, so "
+            "how many particles there are is not chosen by itself; say how many, such as "
+            "ParticleFilter(30)"
         )
     if engine.auxiliary is True or isinstance(engine.proposal, str):
         option = "auxiliary=True" if engine.auxiliary is True else 'proposal="optimal"'
         return (
             f"ParticleFilter: {option} reads densities, and those that depend on the objects of "
-            f"{name!r} cannot be read; "
-            "give a function"
+            f"{name!r} cannot be read; give a function"
+        )
+    if engine.recovery is not None or engine.rejuvenation is not None:
+        option = "recovery=" if engine.recovery is not None else "rejuvenation="
+        return (
+            f"ParticleFilter: {option} draws numbers anew, and what the objects of {name!r} would be "
+            "then is not known; leave it out"
         )
     if engine.marginalize is not None:
         return (

@@ -74,7 +74,7 @@ class MapField:
     sigma: float = 0.06
     z_hit: float = 0.9
     z_rand: float = 0.1
-    tempering: float = 0.1
+    tempering: float = 0.3
 
     def __post_init__(self) -> None:
         if not isinstance(self.laser, Laser):

@@ -7,8 +7,6 @@ through a table.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from bayesmc.robotics.grid_map import FAR, TILE
@@ -36,7 +34,6 @@ class MapWindows:
         nx, ny = (int(n) for n in (last - first).max(axis=0) + 1)
         self.shape = (nx * TILE, ny * TILE)
         self.corner = first * TILE
-        #: one row beyond the last cell stands for what is outside
         cells = np.full((len(maps), nx, TILE, ny, TILE), FAR, dtype=np.uint8)
         for part, own, (i, j) in zip(cells, maps, first.tolist(), strict=True):
             if len(own.squares) < nx * ny:
@@ -49,7 +46,7 @@ class MapWindows:
         self.flat = cells.reshape(-1)
 
     def sums(self, poses: np.ndarray, points: np.ndarray, table: np.ndarray) -> np.ndarray:
-        """Sums of ``table`` over the cells where points lie, as seen from poses.
+        """Sums of ``table``, between the middles of cells interpolated, where points lie as seen from poses.
 
         Parameters
         ----------
@@ -64,13 +61,35 @@ class MapWindows:
         ndarray, shape (maps, poses)
         """
         found = np.empty(poses.shape[:2])
+        table = table.astype(np.float32)
         step = max(1, _BLOCK // max(1, len(points) * len(poses)))
         for start in range(0, poses.shape[1], step):
-            part = poses[:, start : start + step]
-            x, y = self.cells(part, points)
-            at = self.places(np.floor(x).astype(np.int64), np.floor(y).astype(np.int64))
-            found[:, start : start + step] = table[self.flat[at]].sum(axis=-1)
+            x, y = self.cells(poses[:, start : start + step], points)
+            values = self._between(x, y, table)
+            np.add.reduce(values, axis=-1, out=found[:, start : start + step])
         return found
+
+    def _between(self, x: np.ndarray, y: np.ndarray, table: np.ndarray) -> np.ndarray:
+        """The table at points given in cells, linear in both directions between four middles."""
+        nx, ny = self.shape
+        x -= np.float32(0.5)
+        y -= np.float32(0.5)
+        np.clip(x, 0, nx - 2, out=x)
+        np.clip(y, 0, ny - 2, out=y)
+        ix, iy = x.astype(np.int32), y.astype(np.int32)
+        x -= ix
+        y -= iy
+        first = np.arange(len(ix), dtype=np.intp) * (nx * ny)
+        at = ix * np.intp(ny) + iy + first.reshape(-1, *(1,) * (ix.ndim - 1))
+        low = table[self.flat[at]]
+        low += y * (table[self.flat[at + 1]] - low)
+        at += ny
+        high = table[self.flat[at]]
+        high += y * (table[self.flat[at + 1]] - high)
+        high -= low
+        high *= x
+        low += high
+        return low
 
     def cells(self, poses: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Where points lie, in cells from each window's corner, shape (maps, ..., points)."""
@@ -84,24 +103,28 @@ class MapWindows:
             (y0 + (s * px + c * py)).astype(np.float32),
         )
 
-    def places(self, ix: np.ndarray, iy: np.ndarray) -> np.ndarray:
-        """Positions in the flat array; those outside a window are moved onto its edge."""
+    def rows(self, x: np.ndarray) -> np.ndarray:
+        """Where the cells at ``x``, shape (maps, ...), begin in the flat array; those outside on the edge."""
         nx, ny = self.shape
-        ix = np.clip(ix, 0, nx - 1)
-        iy = np.clip(iy, 0, ny - 1)
-        first = np.arange(len(ix), dtype=np.int64) * (nx * ny)
-        return np.asarray(ix * ny + iy + first.reshape(-1, *(1,) * (ix.ndim - 1)))
+        cells = np.clip(x, 0, nx - 1).astype(np.intp)
+        cells *= ny
+        first = np.arange(len(x), dtype=np.intp) * (nx * ny)
+        cells += first.reshape(-1, *(1,) * (x.ndim - 1))
+        return cells
+
+    def columns(self, y: np.ndarray) -> np.ndarray:
+        """What cells at ``y`` add to that."""
+        return np.clip(y, 0, self.shape[1] - 1).astype(np.intp)
 
 
 def around(
     poses: np.ndarray, points: np.ndarray, slack: float | np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Bounds of the points seen from poses (maps, poses, 3), with some room (m), shape (maps, 2) each."""
-    reach = float(np.hypot(*points.T).max()) if len(points) else 0.0
     c, s = np.cos(poses[..., 2:]), np.sin(poses[..., 2:])
     px, py = points.T if len(points) else np.zeros((2, 1))
     x, y = poses[..., :1] + c * px - s * py, poses[..., 1:2] + s * px + c * py
-    room = np.reshape(slack, (-1, 1)) + min(reach, math.inf) * 0.0
+    room = np.reshape(slack, (-1, 1))
     low = np.stack([x.min(axis=(1, 2)), y.min(axis=(1, 2))], axis=-1) - room
     high = np.stack([x.max(axis=(1, 2)), y.max(axis=(1, 2))], axis=-1) + room
     return low, high

@@ -1,6 +1,6 @@
 """Where a scan fits a map: a Gaussian about the best pose near the one that odometry expects, as a proposal.
 
-Poses are laid around what the motion says, in two passes: a lattice that is wide enough for its noise,
+Poses are laid around what the motion says, in three passes: a lattice that is wide enough for its noise,
 scored with fewer beams, and a finer one laid out along the axes of what the first leaves. The moments
 of what they find are those of the proposal. All particles go through both at once, each in its own map.
 """
@@ -26,7 +26,7 @@ from bayesmc.shapes import broadcast_shapes
 #: deviations of the motion's noise that are searched to either side
 _REACH = 3.0
 #: deviations of what the first pass leaves that the second covers, and points along each axis
-_SPAN, _POINTS = 2.5, 7
+_SPAN, _POINTS = 2.5, 5
 #: points of the lattice to either side, at most: of each coordinate, and of the heading
 _SHIFTS, _TURNS = 4, 10
 _EYE = np.eye(3)
@@ -153,8 +153,9 @@ class ScanMatcher:
             windows = MapWindows(maps[part], low[part], high[part])
             prior = _Moments(mean[part], cov[part])
             first = self._lattice(windows, prior, ends, wide)
-            second = self._along(windows, prior, ends, first)
-            mean[part], cov[part] = second
+            some = ends[:: max(1, math.ceil(len(ends) / self.beams))]
+            second = self._along(windows, prior, some, len(ends) / len(some), first)
+            mean[part], cov[part] = self._along(windows, prior, ends, 1.0, second)
 
     def _lattice(
         self, windows: MapWindows, prior: _Moments, ends: np.ndarray, wide: np.ndarray
@@ -173,12 +174,16 @@ class ScanMatcher:
         poses[..., 2] += turns
         x, y = windows.cells(poses, some)
         log = np.empty((*poses.shape[:2], len(shift[0]), len(shift[1])))
-        columns = [np.floor(y + np.float32(dy / size)).astype(np.int64) for dy in shift[1]]
+        at, squares = np.empty(x.shape, dtype=np.intp), np.empty(x.shape, dtype=np.uint8)
+        values = np.empty(x.shape, dtype=np.float32)
+        columns = [windows.columns(y + np.float32(dy / size)) for dy in shift[1]]
         for a, dx in enumerate(shift[0]):
-            row = np.floor(x + np.float32(dx / size)).astype(np.int64)
+            row = windows.rows(x + np.float32(dx / size))
             for b, column in enumerate(columns):
-                at = windows.places(row, column)
-                log[:, :, a, b] = table[windows.flat[at]].sum(axis=-1)
+                np.add(row, column, out=at)
+                np.take(windows.flat, at, out=squares, mode="clip")  # they lie within
+                np.take(table, squares, out=values, mode="clip")
+                np.add.reduce(values, axis=-1, out=log[:, :, a, b])
         grid = np.meshgrid(turns, *shift, indexing="ij")
         off = np.stack([grid[1], grid[2], grid[0]], axis=-1).reshape(-1, 3)
         log = log.reshape(len(log), -1) + _normal_log(off, prior.cov)
@@ -187,11 +192,15 @@ class ScanMatcher:
         return _Moments(prior.mean + found.mean, found.cov + np.diag(step**2 / 12))
 
     def _along(
-        self, windows: MapWindows, prior: _Moments, ends: np.ndarray, first: _Moments
+        self,
+        windows: MapWindows,
+        prior: _Moments,
+        ends: np.ndarray,
+        share: float,
+        first: _Moments,
     ) -> _Moments:
-        """Moments over poses along the axes of what the first pass leaves."""
-        size = windows.resolution
-        table = self.field.table(size)
+        """Moments over poses along the axes of what the pass before leaves."""
+        table = share * self.field.table(windows.resolution)
         line = np.linspace(-_SPAN, _SPAN, _POINTS)
         points = np.stack(np.meshgrid(line, line, line, indexing="ij"), axis=-1).reshape(-1, 3)
         root = np.linalg.cholesky(first.cov)
