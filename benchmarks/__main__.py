@@ -14,6 +14,7 @@ from benchmarks import (
     bench_mean_field,
     bench_robot_logs,
     bench_robots,
+    bench_slam,
     bench_scale,
     bench_switching,
     bench_time,
@@ -54,3 +55,5 @@ if __name__ == "__main__":
         bench_fading.main()
         print()
         bench_robot_logs.main()
+        print()
+        bench_slam.main(())
