@@ -19,7 +19,7 @@ help:
 	@echo "make lint    ruff, formatting, mypy"
 	@echo "make format  let ruff mend formatting and import order"
 	@echo "make counts  count lines, the modules that a call runs in, and the functions that are followed"
-	@echo "make docs    run every snippet of README, docs and docstrings"
+	@echo "make docs    run every snippet of README, docs and docstrings, and build the site: out/site"
 	@echo "make bench   time bayesmc beside hand-written code (and peers, after 'make peers')"
 	@echo "make peers   install the packages that the benchmarks compare with, in .venv-peers"
 	@echo "make references  hold bayesmc against BUGS and posteriordb, beside JAGS and PyMC: docs/accuracy.md (long)"
@@ -57,8 +57,10 @@ format: .venv/.extras-dev
 counts: .venv/.extras-plot,arviz,robotics,fast,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.counts
 
-docs: .venv/.extras-plot,arviz,robotics,fast,test
+docs: .venv/.extras-plot,arviz,robotics,fast,test .venv/.extras-plot,arviz,robotics,docs
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
+	OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -q -W --keep-going -b html docs out/site
+	@echo "the site is in out/site/index.html"
 
 bench: .venv/.extras-plot,arviz,robotics,fast,test
 	$(PY) -m benchmarks

@@ -338,7 +338,11 @@ def sees_the_prior(kind: str, seed: int, test: str) -> bool:
 #: engines, and kinds of nets that have something for them to move
 SWEPT = [
     *itertools.product(OF_STATES, SCALARS),
-    *(("HamiltonianMonteCarlo", kind) for kind in SCALARS if "hybrid" in kind),
+    *(
+        pytest.param("HamiltonianMonteCarlo", kind, marks=pytest.mark.thorough)
+        for kind in SCALARS
+        if "hybrid" in kind
+    ),
     *(pytest.param(e, "gaussian", marks=pytest.mark.thorough) for e in CHAIN_ENGINES),
 ]
 

@@ -24,6 +24,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "bayesmc"
 
 # Top to bottom. A package counts as one room; rooms on one line do not import each other.
 LAYERS = """
+__main__
 robotics | plotting | io | testing
 auto
 pmcmc

@@ -34,7 +34,10 @@ def blind(seed: int) -> Verdict:
     return Verdict("blind", ALPHA, check(seed).comparisons[-1:] if found > 100 else ())
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    "mutant",
+    [pytest.param(m, id=m.name, marks=[pytest.mark.thorough] * m.is_long) for m in MUTANTS],
+)
 def test_caught(mutant: Mutant) -> None:
     trial = tried(mutant, 1)
     assert not trial.broken, trial.broken

@@ -25,7 +25,7 @@ _NEVER = 2.0  # a threshold that no uniform number reaches
 
 
 class Categorical(Distribution):
-    """Categorical distribution on the states ``0 .. K-1``.
+    """Categorical distribution on the states ``0`` to ``K - 1``.
 
     Give exactly one of ``probs`` and ``logits``.
 

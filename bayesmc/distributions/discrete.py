@@ -266,7 +266,7 @@ class Poisson(Distribution):
 
 
 class DiscreteUniform(Distribution):
-    """Uniform distribution on the integers ``low .. high``, both included.
+    """Uniform distribution on the integers from ``low`` to ``high``, both included.
 
     Parameters
     ----------

@@ -51,8 +51,12 @@ _KNOWN: dict[type, frozenset[str]] = {}
 
 @functools.cache
 def signature(family: type) -> inspect.Signature:
-    """The parameters of a family's constructor."""
-    return inspect.signature(family)
+    """The parameters of a family's constructor.
+
+    Those of ``__init__``: Python 3.11.2 reads a class whose ``__init__`` is inherited by its ``__new__``,
+    which takes anything.
+    """
+    return inspect.Signature(list(inspect.signature(family.__init__).parameters.values())[1:])  # type: ignore[misc]
 
 
 def check_keywords(family: type, keywords: KeysView[str]) -> None:

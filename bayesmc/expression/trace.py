@@ -222,7 +222,9 @@ def is_left(value: Any) -> bool:
 @lru_cache(maxsize=256)
 def _starred(make: Callable[..., Any]) -> str:
     """The name of ``*parts`` in a signature, where there is one."""
-    parameters = inspect.signature(make).parameters.values()
+    # of a class its __init__'s: Python before 3.11.3 may take a class's signature from elsewhere
+    own = make.__init__ if isinstance(make, type) else make  # type: ignore[misc]
+    parameters = inspect.signature(own).parameters.values()
     return next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
 
 

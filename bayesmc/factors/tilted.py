@@ -122,16 +122,18 @@ def probit(sign: np.ndarray, offset: np.ndarray, gain: np.ndarray, precision: np
     with np.errstate(all="ignore"):
         var = 1.0 / precision
         mean = var * linear
-        root = np.sqrt(1.0 + gain**2 * var)
-        z = sign * (offset + gain * mean) / root
+        turned = sign * gain
+        over = 1.0 / np.sqrt(1.0 + turned * turned * var)
+        z = (sign * offset + turned * mean) * over
         log_cdf = special.log_ndtr(z)
         ratio = np.exp(-0.5 * z * z - 0.5 * _LOG_2PI - log_cdf)
-        slope = sign * gain * var / root
-        found = mean + slope * ratio
-        spread = var - slope**2 * ratio * (z + ratio)
-        log = log_cdf + 0.5 * (linear * mean + _LOG_2PI - np.log(precision))
-    log = np.where(precision > 0, log, np.nan)
-    return Tilt(log, found[..., None], spread[..., None, None])
+        slope = turned * var * over
+        pull = slope * ratio
+        spread = var - slope * pull * (z + ratio)
+        log = log_cdf + 0.5 * (linear * mean + _LOG_2PI + np.log(var))
+    if not (precision > 0).all():
+        log = np.where(precision > 0, log, np.nan)
+    return Tilt(log, (mean + pull)[..., None], spread[..., None, None])
 
 
 def mixed(log: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> Tilt:

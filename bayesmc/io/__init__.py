@@ -15,13 +15,14 @@ from bayesmc.errors import CycleError, FileFormatError
 from bayesmc.io.adapters import from_pgmpy, from_pyagrum, to_networkx
 from bayesmc.io.bif import format_bif, parse_bif
 from bayesmc.io.content import read_bytes, read_text, write_bytes
+from bayesmc.io.data import read_data
 from bayesmc.io.record import TableNode
 from bayesmc.io.tables import check_net, records
 from bayesmc.io.xmlbif import format_xmlbif, parse_xmlbif
 from bayesmc.network import BayesNet
 from bayesmc.network.node import topological_order
 
-__all__ = ["from_pgmpy", "from_pyagrum", "read", "to_networkx", "write"]
+__all__ = ["from_pgmpy", "from_pyagrum", "read", "read_data", "to_networkx", "write"]
 
 
 class _Format(NamedTuple):

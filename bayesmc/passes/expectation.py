@@ -354,7 +354,9 @@ class Expectation:
         raise self.refuse(read, f"power {p:g} of it has no expectation in closed form")
 
     def _feature(self, read: Expression, feature: str) -> Expression:
-        (name,) = self.names(read)
+        name, *others = self.names(read)
+        if others:
+            raise self.refuse(read, f"{feature} of several nodes has no expectation in closed form")
         own = self.hidden[name]
         fits = _is_read(read) and feature in _FEATURES[own.kind]
         if not fits or (own.kind == "matrix" and feature == "log"):

@@ -24,6 +24,7 @@ from bayesmc import distributions as d
 from bayesmc.errors import TraceError
 from bayesmc.expression import Constant, Expression, Family, TracedArray, as_expression, trace
 from bayesmc.expression.composed import log_sum_exp
+from bayesmc.expression.graph import cast
 from bayesmc.passes.interval_mass import log_mass
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -147,8 +148,8 @@ def _own_form(family: Family, x: Any) -> Any:
 
 
 def _stand_in(value: Any) -> Any:
-    if isinstance(value, Expression):
-        return TracedArray(value)
+    if isinstance(value, Expression):  # a condition, as a probability, is a number
+        return TracedArray(cast(value, float) if value.dtype.kind == "b" else value)
     if isinstance(value, (list, tuple)):
         return type(value)(_stand_in(v) for v in value)
     return value

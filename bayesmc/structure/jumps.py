@@ -79,9 +79,17 @@ def jumps(density: UnconstrainedDensity) -> frozenset[str]:
 
 
 def jumps_between(
-    root: Expression, name: str, values: Values, low: np.ndarray, high: np.ndarray
+    root: Expression,
+    name: str,
+    values: Values,
+    low: np.ndarray,
+    high: np.ndarray,
+    *,
+    to_zero: bool = False,
 ) -> np.ndarray:
     """Whether a log density of free numbers jumps on the ways between pairs of points, where tried.
+
+    From one positive density to another; with ``to_zero``, from a positive one to none.
 
     Parameters
     ----------
@@ -112,7 +120,8 @@ def jumps_between(
         some = max(1, _NUMBERS // _size(steps))
         for start in range(0, len(low), some):
             part = slice(start, start + some)
-            found[part] = _jumped(root, steps, name, values, low[part], high[part], rng)
+            ways = low[part], high[part]
+            found[part] = _jumped(root, steps, name, values, *ways, rng, to_zero)
     return found
 
 
@@ -135,6 +144,7 @@ def _jumped(
     low: np.ndarray,
     high: np.ndarray,
     rng: np.random.Generator,
+    to_zero: bool = False,
 ) -> np.ndarray:
     """Whether the density differs on both sides of a turn, for each way."""
     program, count = Program([root, *steps]), len(low)
@@ -148,6 +158,8 @@ def _jumped(
 
     low, high, turned = _bisected(low, high, looked, rng)
     before, after = (looked(u)[0] for u in (low, high))
+    if to_zero:
+        return turned & (np.isfinite(before) != np.isfinite(after))
     with np.errstate(invalid="ignore"):
         differ = turned & (np.abs(before) < _NEVER) & (np.abs(after) < _NEVER)
         return differ & (np.abs(after - before) > _JUMP * (1.0 + 1e-9 * np.abs(before)))

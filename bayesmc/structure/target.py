@@ -7,7 +7,7 @@ is found here, too: nodes on which nothing observed depends are drawn forward af
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -319,12 +319,15 @@ class Target:
         return tuple(self.terms[t] for t in sorted(entered, key=self._place.__getitem__))
 
     def log_density(
-        self, values: Mapping[str, np.ndarray], terms: Iterable[Term] | None = None
+        self,
+        values: Mapping[str, np.ndarray],
+        terms: Iterable[Term] | None = None,
+        log_of: Callable[[Term, Mapping[str, np.ndarray]], np.ndarray] = Term.log,
     ) -> Any:
         """Sum of terms (all of them by default), shape the batch."""
         total: Any = 0.0
         for term in self.terms.values() if terms is None else terms:
-            log = term.log(values)
+            log = log_of(term, values)
             if term.shape:
                 lead = log.shape[: log.ndim - len(term.shape)]
                 log = np.broadcast_to(log, lead + term.shape)
@@ -369,8 +372,13 @@ def _target(problem: Problem, also: frozenset[str]) -> Target:
             known[name], _ = model.evaluate(name, known)
         elif seen is not None and seen.mask is None:
             known[name] = seen.value
+        elif 0 in node.plate_shape:  # no element of it is hidden
+            known[name] = np.zeros(
+                node.value_shape, float if node.domain is None else node.domain.dtype
+            )
         else:
             varying.add(name)
+    also &= varying
     unsampled = {n for n in varying if model[n].is_stochastic and model[n].unsampled}
     wanted = _ancestors(model, observed, varying, unsampled | also)
     chain = tuple(
@@ -402,7 +410,7 @@ def _ancestors(
     for potential, _ in model.potentials.values():
         wanted |= {p for p in potential.parents if p in varying}
     for name in reversed(list(model.nodes)):
-        if name in wanted or name in observed:
+        if name in wanted or (name in observed and 0 not in model[name].plate_shape):
             wanted |= {p for p in model[name].parents if p in varying}
     return wanted
 
@@ -416,6 +424,8 @@ def _terms(
             continue
         seen = observed.get(name)
         if name not in inside and (seen is None or not varying & set(node.parents)):
+            continue
+        if 0 in node.plate_shape:
             continue
         mask = None if name in inside or seen is None else seen.mask
         terms[name] = Term(model, name, node.plates, node.plate_shape, node.parents, mask=mask)

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
+from typing import Any
+
 import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.distributions.parameters import signature
 
 
 @pytest.mark.parametrize(
@@ -39,3 +43,15 @@ def test_known_parameters_pass_and_families_that_take_any_do():
 
     assert bmc.Gamma(concentration=2.0, rate=3.0).mean == pytest.approx(2 / 3)
     assert Scaled(scale=2.0).scale == 2.0
+
+
+def test_parameters_are_those_of_the_constructor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python 3.11.2 reads a class with an inherited ``__init__`` by its ``__new__``, which takes anything."""
+    read = inspect.signature
+
+    def early(called: Any) -> inspect.Signature:
+        return read(called.__new__ if isinstance(called, type) else called)
+
+    monkeypatch.setattr(inspect, "signature", early)
+    assert list(signature.__wrapped__(bmc.Laplace).parameters) == ["loc", "scale"]
+    assert list(signature.__wrapped__(bmc.Wishart).parameters) == ["df", "scale"]

@@ -9,6 +9,7 @@ import pytest
 
 import bayesmc as bmc
 import bayesmc.distributions as families
+from bayesmc.distributions.parameters import signature
 from bayesmc.expression import Program, TracedArray, TracedCall, is_traced, leaf, trace
 
 X = TracedArray(leaf("x", (2, 3)))
@@ -27,7 +28,7 @@ def families_with_parameters() -> list[tuple[type, str]]:
         if inspect.isclass(family) and issubclass(family, bmc.Distribution):
             if family is bmc.Distribution:
                 continue
-            for key, parameter in inspect.signature(family).parameters.items():
+            for key, parameter in signature(family).parameters.items():
                 if parameter.kind is not inspect.Parameter.VAR_POSITIONAL:
                     found.append((family, key))
     return found
@@ -35,16 +36,16 @@ def families_with_parameters() -> list[tuple[type, str]]:
 
 @pytest.mark.parametrize(("family", "key"), families_with_parameters())
 def test_a_call_with_a_traced_parameter_is_recorded(family: type, key: str) -> None:
-    signature = inspect.signature(family)
+    parameters = signature(family).parameters
     given = {
         name: ONE if name == key else 0.5
-        for name, parameter in signature.parameters.items()
+        for name, parameter in parameters.items()
         if name == key or parameter.default is inspect.Parameter.empty
     }
     call = family(**given)
     assert isinstance(call, TracedCall)
     assert call.function is family
-    assert list(call.arguments) == list(signature.parameters)
+    assert list(call.arguments) == list(parameters)
     assert _traced_of(call) == [key]
     assert call.arguments[key] is given[key]
 

@@ -100,8 +100,17 @@ MODELS = [square, mixed, two_numbers]
 ENGINES = [None, bmc.Gibbs(), bmc.MetropolisHastings()]
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("engine", ENGINES)
+#: in an ordinary run two numbers, which take longest, are asked of one engine
+ASKED = [
+    pytest.param(
+        e, m, marks=[pytest.mark.thorough] * (m is two_numbers and not isinstance(e, bmc.Gibbs))
+    )
+    for e in ENGINES
+    for m in MODELS
+]
+
+
+@pytest.mark.parametrize(("engine", "model"), ASKED)
 def test_hills_have_their_shares(model: Callable, engine: bmc.Engine | None) -> None:
     """Within four stated errors of a sum over a fine grid: one false alarm in 1,700 runs of all nine."""
     net, evidence = model()

@@ -285,6 +285,7 @@ MUTANTS = [
               "(parts**2 /", "0.25 * (parts**2 /"),),
         stated(line, {"y": LONG["y"][:16]}, bmc.ParticleFilter(300), 600),
         "stated_errors_test, 600 runs of 300 particles",
+        is_long=True,
     ),
     Mutant(
         "backward simulation leaves the transition out",
@@ -355,6 +356,7 @@ MUTANTS = [
         evidence_of(shaken, BLIND,
                     bmc.ParticleFilter(100, marginalize="auto", ess_threshold=2.0), 200),
         "unbiased_evidence_test, 200 runs of 100 particles",
+        is_long=True,
     ),
     Mutant(
         "beliefs along smoothed paths are those of the filter",

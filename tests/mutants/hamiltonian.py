@@ -124,19 +124,24 @@ MUTANTS = [
         (Edit(f"{TREE}:_Forest._leaf", "< weight - going[\"new\"]", "< -np.log(leaf + 1.0)"),),
         trajectories(1.0, 200),
         OF.format(200),
+        is_long=True,
     ),
     Mutant(
         "adaptation of trajectories never freezes",
         (Edit("bayesmc.kernels.hamiltonian:Hamiltonian.step", "if warmup:\n", "if True:\n"),),
         ranks(lambda: lambda target: Hamiltonian(unconstrained_density(target)), readings, 20, warmup=10),
         "rank_test, 20 replications (for certain)",
+        is_long=True,
     ),
 ]  # fmt: skip
 
 JACOBIAN, STALE = MUTANTS[0].faults, MUTANTS[1].faults
 if is_available():
     MUTANTS += [
-        Mutant(f"{name}: machine code", faults, trajectories(length, draws, True), OF.format(draws))
+        Mutant(
+            f"{name}: machine code", faults, trajectories(length, draws, True), OF.format(draws),
+            is_long=draws > 200,
+        )
         for name, faults, length, draws in (
             ("a Jacobian is missing", JACOBIAN, 0.8, 20),
             ("a gradient is stale", STALE, 0.8, 400),

@@ -34,12 +34,15 @@ class Mutant:
         ``test(seed) -> Verdict``: makes everything anew, as compiled models are kept.
     by : str
         The test in words, with its documented number of draws.
+    is_long : bool
+        Its test takes seconds, and its neighbours' are like it: for ``make mutants`` and thorough runs.
     """
 
     name: str
     faults: tuple[Fault, ...]
     test: Callable[[int], Verdict]
     by: str
+    is_long: bool = False
 
     @property
     def where(self) -> str:

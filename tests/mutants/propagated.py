@@ -141,6 +141,13 @@ MUTANTS = [
         BY,
     ),
     Mutant(
+        "of rows that are visited at once the own Gaussian stays in the cavity",
+        (Edit(f"{AT}lines:LineBatch.visit", "precision = own - self.precision[:, 0, 0]",
+              "precision = own.copy()"),),
+        told(halved, {"large": 1}, {k: v for k, v in HALVED.items() if k != "log"}),
+        BY,
+    ),
+    Mutant(
         "the evidence forgets what Gaussian messages integrate to",
         (Edit(f"{AT}batch:Batch._constants",
               "logs -= log_integral(own, found.linear + self.linear[at])", "pass"),),
@@ -149,8 +156,8 @@ MUTANTS = [
     ),
     Mutant(
         "damping keeps the new share instead of the old",
-        (Edit(f"{AT}sweeps:settle", "share, skipped, left, change, done = 1.0 - damping",
-              "share, skipped, left, change, done = damping"),),
+        (Edit(f"{AT}pace:Pace.__init__", "self.given = self.share = 1.0 - damping",
+              "self.given = self.share = damping"),),
         told(disguised, {}, {"var x": np.array(0.25), "mean x": np.array(0.75)}, sweeps=1, damping=0.25),
         "repeated_test of one sweep (no draws)",
     ),

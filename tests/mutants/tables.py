@@ -34,7 +34,7 @@ MUTANTS: tuple[Mutant, ...] = (
         "tables are not resampled with their particles",
         (Edit("bayesmc.engines.marginal.tables.beliefs:Tables.taken",
               "log.take(ancestors, axis=0)", "log[: len(ancestors)]"),),
-        TEST, BY,
+        TEST, BY, is_long=True,
     ),
     Mutant(
         "a reading updates another element than the one that it reads",
@@ -46,7 +46,7 @@ MUTANTS: tuple[Mutant, ...] = (
         "a particle is weighed by the likeliest state of a table, not by the sum over states",
         (Edit("bayesmc.engines.marginal.tables.groups:touched",
               "sums[every, at] += total", "sums[every, at] += own.max(axis=-1)"),),
-        TEST, BY,
+        TEST, BY, is_long=True,
     ),
     Mutant(
         "elements that no reading reads forget their transition",

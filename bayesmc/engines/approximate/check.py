@@ -9,8 +9,9 @@ tails of q none of its own draws has met, and their weights cannot tell.
 References
 ----------
 Vehtari, Simpson, Gelman, Yao and Gabry (2024), Pareto smoothed importance sampling, JMLR 25, algorithm 1 and
-sec. 3.3; Yao, Vehtari, Simpson and Gelman (2018), Yes, but did it work?: Evaluating variational inference,
-ICML, sec. 3.1.
+sec. 3.3; Chatterjee and Diaconis (2018), The sample size required in importance sampling, Annals of Applied
+Probability 28, sec. 1; Yao, Vehtari, Simpson and Gelman (2018), Yes, but did it work?: Evaluating variational
+inference, ICML, sec. 3.1.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from bayesmc.diagnostics import MAX_PARETO_K, pareto_k
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.approximate.approximation import Approximation, Drawn
 from bayesmc.engines.approximate.evidence import log_constants
+from bayesmc.engines.approximate.rare import log_of
 from bayesmc.engines.approximate.stored import as_stored, completed
 from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Problem
@@ -37,6 +39,8 @@ from bayesmc.structure.target import target_of
 _FEWEST = 25
 #: differences of log weights that are rounding
 _EQUAL = 1e-7
+#: below this shape weights have a variance
+_FINITE = 0.5
 #: share of a standard deviation up to which answers are near
 _NEAR = 0.15
 #: rows of the summary
@@ -153,9 +157,11 @@ class Check:
             node = self.posterior.model[name]
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
                 continue
-            # of what draws answer the same draws without weights: what moves is no chance
-            closed = self.approximation.marginal(name) is not None
-            before_weights = self.approximate if closed else self._unweighted
+            # of what draws answer, the same draws without weights, unless these have heavier tails
+            own = self.approximation
+            closed = own.marginal(name) is not None or own.probabilities(name) is not None
+            is_plain = closed or getattr(own, "spread", None) is not None
+            before_weights = self.approximate if is_plain else self._unweighted
             plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
             before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
             error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
@@ -196,7 +202,8 @@ def checked(
         )
     own = _weighed(posterior, approximation, approximation.draw(rng, int(draws)), rng)
     spread, found = getattr(approximation, "spread", None), own
-    if spread is not None and own.k > -np.inf:
+    # equal weights say that it is exact, unless it has left states out that no draw meets
+    if spread is not None and (own.k > -np.inf or hasattr(approximation, "tied")):
         found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
     k = max(
         own.k, found.k
@@ -229,14 +236,18 @@ def log_joint(problem: Problem, names: Any, values: Any, draws: int) -> np.ndarr
             "depends"
         )
     with marking_invalid(), np.errstate(all="ignore"):
-        found = np.broadcast_to(target.log_density(values), (draws,))
+        found = np.broadcast_to(target.log_density(values, log_of=log_of), (draws,))
     return found + log_constants(target)
 
 
 def pareto_smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     """Log weights with their largest replaced by quantiles of a generalised Pareto law, and its shape k.
 
-    Weights that are equal to rounding are left as they are, with k minus infinity.
+    Weights that are equal to rounding are left as they are, with k minus infinity. The fit takes weights that
+    come in lumps (of finite states), or one that stands out among next to equal ones, for a heavy tail. Of
+    weights with that tail the largest of S carries about S^(k - 1) of their sum (Chatterjee and Diaconis 2018
+    judge by that share); where it carries less than 1/sqrt(S), as it does of those with a variance, weights
+    are left as they are, and k is the shape of so small a largest one.
     """
     from arviz_stats.base import array_stats
 
@@ -245,6 +256,9 @@ def pareto_smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
     if possible.all() and top - low < _EQUAL:
         return log_weights.copy(), -np.inf
     k = pareto_k(log_weights[possible], log_weights.size)
+    largest = _shape_of_largest(log_weights)
+    if largest < _FINITE <= k:  # a lump of weights, as of finite states, and no tail
+        return log_weights.copy(), largest
     bottom = max(low, top - 600.0)  # what is farther below is nothing, and stays so
     filled = np.where(possible, np.maximum(log_weights, bottom), bottom - 50.0)
     try:
@@ -290,6 +304,12 @@ def _weighed(
     assert ess is not None
     found.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
     return found
+
+
+def _shape_of_largest(log_weights: np.ndarray) -> float:
+    """The shape of a tail whose largest weight carries the share of all that this one does."""
+    share = log_weights.max() - float(log_sum_exp(log_weights[None]))
+    return float(1.0 + share / np.log(log_weights.size))
 
 
 def _doubt(check: Check) -> str:

@@ -69,6 +69,8 @@ def _left(target: Target) -> Iterator[Term]:
         node = model[name]
         if name in target.terms or not node.is_stochastic or name in target.chain:
             continue
+        if 0 in node.plate_shape:
+            continue
         if node.declaration.source != "variable":
             yield Term(model, name, node.plates, node.plate_shape, node.parents, mask=seen.mask)
     for name, (potential, _) in model.potentials.items():

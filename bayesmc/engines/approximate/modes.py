@@ -21,6 +21,8 @@ from bayesmc.distributions.circular import wrap_angle
 from bayesmc.structure.curvature import Curvature, Curved
 from bayesmc.structure.free_density import UnconstrainedDensity
 
+#: curvature below which rounding hides nothing of a free number that is of order one
+_HIDDEN = 1e-4
 #: iterations of the quasi-Newton method, and of Newton's
 _FAR, _NEAR = 2000, 100
 #: standard deviations that a Newton step may still move the mode, where it is done, and where that is enough
@@ -315,6 +317,13 @@ class _Scaled:
         flat = [k for k, v in enumerate(self.values) if v <= self.floor][:4]
         ways = "; ".join(named(labels, self.unit * self.vectors[:, k]) for k in flat)
         how = "flat" if self.values[0] > -self.floor else "not curved downwards"
+        steepest = float(np.abs(np.diag(self.curved.matrix)).max(initial=0.0))
+        if steepest * np.finfo(float).eps > _HIDDEN and how == "flat":
+            return (
+                f"the log density is so steep at its mode (as of noise with a standard deviation of "
+                f"{steepest**-0.5:.2g}) that rounding hides how it bends along {ways} (free numbers); give "
+                "more noise, or use Exact() where all is linear-Gaussian"
+            )
         return (
             f"the mode lies on a ridge: the log density is {how} along {ways} (free numbers), which data "
             "and priors leave undetermined; give these nodes a proper prior, or drop one of them"

@@ -22,6 +22,8 @@ from bayesmc.structure.unconstrained import without_volume
 
 #: climbs
 _STARTS = 8
+#: shares below this lie at the edge of their simplex
+_NO_SHARE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +42,8 @@ class PosteriorMode:
         What the change of variables to unconstrained numbers adds to it there, which `LaplaceApproximation`
         counts and this does not.
     at_edge : tuple of str
-        Numbers that lie at the edge of their support, where the density is largest in the limit.
+        Numbers that lie at the edge of their support, where the density is largest in the limit; of shares
+        (a Dirichlet node) those components that are 0.
     summed : tuple of str
         Finite hidden nodes, summed out.
     left_out : tuple of str
@@ -151,7 +154,7 @@ def map(  # noqa: A001 - the name that everybody knows it by
         _values(target, density, best_mode),
         best_mode.log_density + log_constants(target),
         float(full.log_volume(best_mode.u)),
-        tuple(label for label, out in zip(density.labels, best_mode.edge, strict=True) if out),
+        _at_edge(density, best_mode),
         density.summed,
         tuple(n for n in target.forward if problem.model[n].is_stochastic),
         len(found),
@@ -209,6 +212,27 @@ def _values(target: Target, density: UnconstrainedDensity, mode: Mode) -> dict[s
             value.flags.writeable = False
             found[name] = value
     return found
+
+
+def _at_edge(density: UnconstrainedDensity, mode: Mode) -> tuple[str, ...]:
+    """Numbers at the edge of their support; of shares those that are 0, whichever free number led there."""
+    found: list[str] = []
+    values = density.constrain(mode.u)
+    for node in density.nodes:
+        out = mode.edge[node.start : node.start + node.size]
+        if not out.any():
+            continue
+        own, name = node.node, node.name
+        if own.support is None or own.support.kind != "simplex":
+            found += [label for label, is_out in zip(node.labels, out, strict=True) if is_out]
+            continue
+        value = np.broadcast_to(values[name], own.value_shape)
+        moved = np.ones(own.plate_shape, bool)
+        if node.elements is not None:
+            moved = np.isin(np.arange(moved.size), node.elements).reshape(own.plate_shape)
+        for at in zip(*np.nonzero((value < _NO_SHARE) & moved[..., None]), strict=True):
+            found.append(f"{name}[{', '.join(str(int(i)) for i in at)}]")
+    return tuple(found)
 
 
 def _warn(best: Mode, lost: list[NoMode]) -> None:

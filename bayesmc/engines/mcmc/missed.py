@@ -328,6 +328,8 @@ def _still(posterior: ChainsPosterior | ChainsSums, name: str) -> np.ndarray:
     stored = posterior._stored.get(name)
     if stored is None:
         return np.zeros(shape, dtype=bool)
+    if 0 in shape:
+        return np.zeros(shape, dtype=bool)
     seen = posterior._seen.get(name)
     still = (stored == stored[:1, :1]).all(axis=(0, 1)).reshape(*shape, -1).all(axis=-1)
     if seen is None or seen.mask is None:

@@ -16,6 +16,7 @@ from bayesmc.engines.propagation.conjugate import ConjugateBatch
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.density import Read
 from bayesmc.engines.propagation.kernels import Switched, Tables
+from bayesmc.engines.propagation.lines import LineBatch
 from bayesmc.engines.propagation.scopes import Rows, basis, padded
 from bayesmc.engines.propagation.statistics import Kept, Linear, OwnFamilies
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
@@ -25,6 +26,7 @@ from bayesmc.structure.target import Target
 
 #: coordinates of one component, whose covariance is kept whole
 _WIDEST = 4000
+_EPSILON = float(np.finfo(float).eps)
 #: name, scope and logs of a factor of finite variables
 Table = tuple[str, tuple[Variable, ...], np.ndarray]
 
@@ -157,14 +159,15 @@ class Assembly:
         assert domain is not None
         return domain.size
 
-    def _groups(self) -> Iterable[Sequence[int]]:
-        """Coordinates that one factor reads."""
+    def _groups(self) -> Iterable[np.ndarray]:
+        """Coordinates that one factor reads, a row for each."""
         for row in self.rows:
             if len(row.coordinates):
-                yield row.coordinates.tolist()
+                yield row.coordinates[None]
         for read in self.reads:
             if read.coordinates.shape[1]:
-                yield from np.unique(read.coordinates, axis=0).tolist()
+                shared = (read.coordinates == read.coordinates[:1]).all()
+                yield read.coordinates[:1] if shared else read.coordinates
 
     def _clamp(self) -> None:
         """Elements of partly observed finite nodes are what was seen."""
@@ -296,8 +299,9 @@ class Assembly:
         for block in np.unique(sizes):
             mine = np.flatnonzero(sizes == block)
             at = coordinates[mine]
+            kind = LineBatch if weights.shape[1] == 1 and not edges else Batch
             found.append(
-                Batch(
+                kind(
                     name,
                     kernel,
                     len(mine),
@@ -328,7 +332,7 @@ class Assembly:
                 ]
         total = len(variables) + len(scopes)
         edges = [(len(variables) + k, index[v]) for k, s in enumerate(scopes) for v in set(s)]
-        parts = components(total, edges).max(initial=-1) + 1
+        parts = components(total, [np.array(edges)] if edges else []).max(initial=-1) + 1
         return len(edges) > total - parts
 
 
@@ -348,11 +352,28 @@ def _begin(problem: Problem, system: System) -> None:
             cov = wide @ np.matrix_transpose(batch.weights)
             batch.begin(beliefs, middle, cov)
     for block in beliefs.blocks:
-        if len(block.linear) and block.refreshed().any():
+        if not len(block.linear):
+            continue
+        improper = block.refreshed()
+        if improper.any():
+            _refuse_improper(block.precision[improper][0])
+
+
+def _refuse_improper(precision: np.ndarray) -> None:
+    """Say why numbers have no joint Gaussian: no prior, or one beside which noise is too small to tell."""
+    own = precision.diagonal()
+    if np.isfinite(precision).all() and (own > 0).all():
+        smallest = np.linalg.eigvalsh(precision)[0]
+        if abs(smallest) <= 10.0 * len(own) * _EPSILON * own.max():
             raise UnsupportedError(
-                "ExpectationPropagation: some numbers have no proper prior; give every node a density that "
-                "has an integral"
+                "ExpectationPropagation: rounding hides what is known of some numbers beside noise as small "
+                f"as a standard deviation of {own.max() ** -0.5:.2g}, or they have no proper prior; give "
+                "more noise or a narrower prior, or use Exact() where all is linear-Gaussian"
             )
+    raise UnsupportedError(
+        "ExpectationPropagation: some numbers have no proper prior; give every node a density that "
+        "has an integral"
+    )
 
 
 def _global(beliefs: Beliefs, batch: Batch) -> np.ndarray:

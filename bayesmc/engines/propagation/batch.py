@@ -17,7 +17,7 @@ from bayesmc.factors.tilted import Tilt, inverses, log_integral, log_sum, mixed
 from bayesmc.gaussian import try_cholesky
 
 #: a cavity or message this small, beside what it is a difference of, is rounding
-_ROUNDING = 1e-13
+ROUNDING = 1e-13
 #: errors of quadrature above this are rough, and the share of the way that is gone with them at most
 _ROUGH, _CAUTIOUS = 0.1, 0.1
 
@@ -138,7 +138,7 @@ class Batch:
         fine = np.isfinite(found.log) & (found.log > self.floor)
         self.error = max(self.error, found.error)
         skipped = int((~fine).sum())
-        if members is None:
+        if len(at) > 1:
             share = cautious(share, found.error)
         self._send_tables(beliefs, at, found, fine, share if self.k else _whole(share))
         if self.k:
@@ -181,7 +181,7 @@ class Batch:
             precision = own - self.precision[at]
             linear = np.matvec(own, near[0]) - self.linear[at]
             size = np.abs(own).max(axis=(-2, -1), keepdims=True) if self.k > 1 else own
-            precision = np.where(np.abs(precision) < _ROUNDING * size, 0.0, precision)
+            precision = np.where(np.abs(precision) < ROUNDING * size, 0.0, precision)
             with np.errstate(all="ignore"):
                 tilt = self._product(beliefs, at, precision, linear, near)
         else:
@@ -278,6 +278,7 @@ class Batch:
             if self.k == 1:
                 flat = weights[:, 0]
                 own = flat.T @ (precision[:, 0] * flat)
+                own = 0.5 * (own + own.T)
                 blocks.linear[c, columns] += linear[:, 0] @ flat
             else:
                 blocks.linear[c, columns] += np.einsum("fki,fk->i", weights, linear)

@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import sparse
 
 from bayesmc.factors.families import Family
 from bayesmc.factors.tilted import log_integral, log_sum
@@ -21,31 +22,33 @@ IMPOSSIBLE = -1e3
 NOTHING = 0.9 * IMPOSSIBLE
 
 
-def components(count: int, groups: Iterable[Sequence[int]]) -> np.ndarray:
+def components(count: int, groups: Iterable[np.ndarray]) -> np.ndarray:
     """The component of each coordinate, where those of a group belong together.
+
+    Parameters
+    ----------
+    count : int
+    groups : iterable of ndarray of int, shape (m, q)
+        A group in every row.
 
     Examples
     --------
+    >>> import numpy as np
     >>> from bayesmc.engines.propagation.beliefs import components
-    >>> components(5, [(0, 2), (2, 4)]).tolist()
+    >>> components(5, [np.array([[0, 2], [2, 4]])]).tolist()
     [0, 1, 0, 2, 0]
     """
-    parent = np.arange(count)
-
-    def top(k: int) -> int:
-        while parent[k] != k:
-            parent[k] = parent[parent[k]]
-            k = int(parent[k])
-        return k
-
-    for group in groups:
-        first = top(int(group[0]))
-        for other in group[1:]:
-            parent[top(int(other))] = first
-    roots = np.array([top(k) for k in range(count)], dtype=int)
-    _, where, found = np.unique(roots, return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(where))
-    return order[found] if count else roots
+    groups = list(groups)
+    if count and any(len(g) == 1 and len(np.unique(g)) == count for g in groups):
+        return np.zeros(count, dtype=int)
+    ends = [(g[:, :1].repeat(g.shape[1] - 1, 1).ravel(), g[:, 1:].ravel()) for g in groups]
+    if not count or not ends:
+        return np.arange(count)
+    one, two = (np.concatenate(e) for e in zip(*ends, strict=True))
+    links = sparse.coo_array((np.ones(len(one), dtype=bool), (one, two)), shape=(count, count))
+    found = sparse.csgraph.connected_components(links, directed=False)[1]
+    _, where, found = np.unique(found, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(where))[found]
 
 
 @dataclass(eq=False)
@@ -68,6 +71,8 @@ class Blocks:
     def refreshed(self, which: np.ndarray | None = None) -> np.ndarray:
         """Invert anew; components that have no integral keep their moments, and are True in the answer."""
         at = slice(None) if which is None else which
+        if len(self.precision) == 1 and which is not None and self._refreshed_one():
+            return np.zeros(1, dtype=bool)
         root, bad = try_cholesky(self.precision[at])
         if bad is None:
             bad = np.zeros(len(root), dtype=bool)
@@ -83,6 +88,19 @@ class Blocks:
             self.cov[at] = np.where(kept[..., None], self.cov[at], cov)
             self.mean[at] = np.where(kept, self.mean[at], mean)
         return bad
+
+    def _refreshed_one(self) -> bool:
+        """Invert the only component anew, where it is proper."""
+        try:
+            root = np.linalg.cholesky(self.precision[0])
+        except np.linalg.LinAlgError:
+            return False
+        left = np.linalg.inv(root)
+        if not np.isfinite(left).all():
+            return False
+        np.matmul(left.T, left, out=self.cov[0])
+        np.matmul(left.T, left @ self.linear[0], out=self.mean[0])
+        return True
 
     @property
     def log_total(self) -> float:

@@ -12,27 +12,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import special
 
-from bayesmc.distributions import Bernoulli, Distribution
+from bayesmc.distributions import Distribution
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.kernels import Density, Probit, Tables
+from bayesmc.engines.propagation.probits import probit_of
 from bayesmc.engines.propagation.scopes import basis
 from bayesmc.errors import BudgetError, TraceError, UnsupportedError
 from bayesmc.expression import (
     Elementwise,
     Expression,
-    Family,
     Program,
     broadcast,
-    cast,
     elementwise,
 )
-from bayesmc.expression.graph import substituted
+from bayesmc.expression.graph import substituted as _with
 from bayesmc.network import Model
 from bayesmc.network.expressions import Opaque, density, log_factor_of, stored_leaf
 from bayesmc.network.model import potential_shape
-from bayesmc.passes.affine import Affine, affine
+from bayesmc.passes.affine import Affine
 from bayesmc.passes.arithmetic import rewritten
 from bayesmc.passes.directions import breaks, directions
 from bayesmc.passes.log_density import family_of, log_density
@@ -120,9 +118,9 @@ class Terms:
     def _read(self, name: str, elements: np.ndarray | None) -> Read:
         shape, plates, parents = self.shape_of(name)
         at = np.arange(math.prod(shape)) if elements is None else elements
-        found = self._as_probit(name, shape, at)
-        if found is not None:
-            return found
+        sure = probit_of(self, name, shape, at)
+        if sure is not None:
+            return Read(name, sure.kernel, (), sure.coordinates, sure.weights, at)
         root = self.log_factor(name, shape)
         free = {n.leaf.name for n in self.numbers.values()} & root.leaves  # type: ignore[attr-defined]
         inner = directions(_widened(root, frozenset(free)), free)
@@ -152,69 +150,39 @@ class Terms:
         self._hold(name, factors, root, coordinates, weights, cards, shape, values)
         return Read(name, factors, places, coordinates, weights, at)
 
-    def _result(self, name: str) -> Any:
+    def result(self, name: str) -> Any:
         found = density(self.model, name, self.cut)
         if isinstance(found, Opaque):
             raise TraceError(found.reason)
         return found.result
-
-    def _as_probit(self, name: str, shape: tuple[int, ...], at: np.ndarray) -> Read | None:
-        """An observed node with the probability of a normal cdf of one affine combination."""
-        if name not in self.model.nodes or name not in self.known:
-            return None
-        family = self._result(name)
-        if not isinstance(family, Family) or family.make is not Bernoulli:
-            return None
-        probs = family.parameters.get("probs")
-        while isinstance(probs, Elementwise) and probs.function is np.multiply:
-            return None
-        if not isinstance(probs, Elementwise) or probs.function is not special.ndtr:
-            return None
-        inside = broadcast(self._substituted(probs.operands[0]), shape)
-        free = {n.leaf.name for n in self.numbers.values()} & inside.leaves  # type: ignore[attr-defined]
-        if (inside.leaves - free) - set(self.known):
-            return None
-        try:
-            form = affine(inside, free)
-        except TraceError:
-            return None
-        offset, gain, coordinates = self.coefficients((form,), self.known, (), shape, at)
-        weights, within = basis(gain.reshape(len(at), 1, -1))
-        sign = 2.0 * np.broadcast_to(self.known[name], shape).reshape(-1)[at] - 1.0
-        kernel = Probit(sign, offset[:, 0, 0], within[:, 0, 0])
-        return Read(name, kernel, (), coordinates, weights, at)
 
     def log_factor(self, name: str, shape: tuple[int, ...]) -> Expression:
         """The log factor of free numbers and what is known or finite."""
         model = self.model
         if name not in model.nodes:
             if isinstance(density(model, name), Opaque):
-                self._result(name)
+                self.result(name)
             root = log_factor_of(model, name)
-            return self._substituted(root)
-        node, family = model[name], self._result(name)
+            return self.substituted(root)
+        node, family = model[name], self.result(name)
         if isinstance(family, Distribution):
             family = family_of(family)
-        parameters = {
-            k: cast(v, float) if isinstance(v, Expression) and v.dtype.kind == "b" else v
-            for k, v in family.parameters.items()
-        }
         value: Expression = stored_leaf(model, node)
         if node.domain is not None and node.domain.low:
             value = elementwise(np.add, value, node.domain.low)
-        root = broadcast(log_density(Family(family.make, parameters), value), shape)
-        root = self._substituted(root)
+        root = broadcast(log_density(family, value), shape)
+        root = self.substituted(root)
         own = self.numbers.get(name)
         if own is not None and not own.is_plain:
             root = elementwise(np.add, root, own.volume)
         return root
 
-    def _substituted(self, root: Expression) -> Expression:
+    def substituted(self, root: Expression) -> Expression:
         """With values of mapped nodes made of their free numbers."""
         mapped = {n: x for n, x in self.numbers.items() if n in root.leaves and not x.is_plain}
         for x in mapped.values():
             root = x.inside(root)
-        return substituted(root, {n: x.value for n, x in mapped.items()})
+        return _with(root, {n: x.value for n, x in mapped.items()})
 
     def configured(
         self,
@@ -292,29 +260,38 @@ class Terms:
                 place = _spread(place, (*full, width), rank).reshape(states, count, inner, width)
                 x = by_leaf[n]
                 coordinate, seen = x.at.reshape(-1)[place], x.seen.reshape(-1)[place]
-                offset = offset + np.where(coordinate < 0, gain * seen, 0.0).sum(axis=-1)
-                own_gain.append(np.where(coordinate < 0, 0.0, gain))
-                own_place.append(np.where(own_gain[-1] == 0, -1, coordinate))
+                known = coordinate < 0
+                if known.any():
+                    offset = offset + np.where(known, gain * seen, 0.0).sum(axis=-1)
+                    gain = np.where(known, 0.0, gain)
+                own_gain.append(gain)
+                own_place.append(coordinate if gain.all() else np.where(gain == 0, -1, coordinate))
             offsets.append(offset)
-            gains.append(np.concatenate(own_gain, axis=-1))
-            places.append(np.concatenate(own_place, axis=-1))
-        offset = np.moveaxis(np.concatenate(offsets, axis=-1), 1, 0)[at]
+            gains.append(_joined(own_gain, -1))
+            places.append(_joined(own_place, -1))
+        offset = np.moveaxis(_joined(offsets, -1), 1, 0)[at]
         widest = max(g.shape[-1] for g in gains)
-        gain = np.concatenate([_filled(g, widest, 0.0) for g in gains], axis=2)
-        place = np.concatenate([_filled(p, widest, -1) for p in places], axis=2)
+        gain = _joined([_filled(g, widest, 0.0) for g in gains], 2)
+        place = _joined([_filled(p, widest, -1) for p in places], 2)
         gain, place = (np.moveaxis(a, 1, 0)[at] for a in (gain, place))
-        coordinates = unique_rows(place.reshape(len(at), -1))
+        flat, where = gain.reshape(len(at), -1), place.reshape(len(at), -1)
+        first, like = where[:1], bool(len(where)) and bool((where == where[:1]).all())
+        coordinates = unique_rows(first if like else where)
         d, m = offset.shape[-1], coordinates.shape[-1]
         if float(len(at)) * states * d * m > _ENTRIES:
             raise BudgetError("ExpectationPropagation: too many coefficients", 8 * _ENTRIES)
+        column = ((first if like else where)[..., None] == coordinates[:, None, :]).argmax(axis=-1)
+        coordinates = np.maximum(np.broadcast_to(coordinates, (len(at), m)), 0)
+        if like and states * d == 1 and (np.bincount(column[0]) <= 1).all():
+            full_gain = np.zeros((len(at), m))
+            full_gain[:, column[0]] = np.where(first < 0, 0.0, flat)
+            return offset, full_gain[:, None, None], coordinates
         full_gain = np.zeros((len(at), states, d, m))
-        flat, where = gain.reshape(len(at), -1), place.reshape(len(at), -1)
-        rows = np.arange(len(at))[:, None]
-        column = (where[..., None] == coordinates[:, None, :]).argmax(axis=-1)
         entry = np.repeat(np.arange(states * d), gain.shape[-1])
         target = full_gain.reshape(len(at), states * d, m)
+        rows = np.arange(len(at))[:, None]
         np.add.at(target, (rows, entry[None, :], column), np.where(where < 0, 0.0, flat))
-        return offset, full_gain, np.maximum(coordinates, 0)
+        return offset, full_gain, coordinates
 
     def _hold(
         self,
@@ -398,6 +375,10 @@ def _spread(value: np.ndarray, full: tuple[int, ...], rank: int) -> np.ndarray:
     missing = len(full) - rank - len(lead)
     shaped = value.reshape((1,) * missing + value.shape)
     return np.broadcast_to(shaped, full)
+
+
+def _joined(parts: Sequence[np.ndarray], axis: int) -> np.ndarray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=axis)
 
 
 def _filled(array: np.ndarray, width: int, value: float) -> np.ndarray:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
@@ -77,6 +78,7 @@ class Probit:
     offset: np.ndarray
     gain: np.ndarray
     how: str = "probit"
+    is_log_concave: ClassVar[bool] = True
 
     def tilted(
         self,
@@ -85,7 +87,9 @@ class Probit:
         linear: np.ndarray,
         near: tuple[np.ndarray, np.ndarray],
     ) -> Tilt:
-        sign, offset, gain = (a[members] for a in (self.sign, self.offset, self.gain))
+        sign, offset, gain = self.sign, self.offset, self.gain
+        if len(members) < len(sign):
+            sign, offset, gain = (a[members] for a in (sign, offset, gain))
         return probit(sign, offset, gain, precision[:, 0, 0], linear[:, 0])
 
 
@@ -162,6 +166,38 @@ class Density:
             found.log.reshape(shape), found.mean.reshape(*shape, k),
             found.cov.reshape(*shape, k, k), found.error,
         )  # fmt: skip
+
+    def interval(self, members: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Outside of which bounds of their one number factors are zero, shape (f,); None where nowhere.
+
+        Of factors with several stretches, from the first to the last.
+        """
+        breaks = self._breaks(members, self.offset[members], self.gain[members])
+        if breaks is None:
+            return None
+        edges = np.sort(breaks[:, 0], axis=-1)  # NaN, where there is none, last
+        last = np.isfinite(edges).sum(axis=-1, keepdims=True)
+        ends = np.take_along_axis(edges, np.maximum(last - 1, 0), axis=-1)
+        wide = 1.0 + np.abs(np.nan_to_num(edges)).max(axis=-1, keepdims=True)
+        filled = np.where(np.isfinite(edges), edges, ends)
+        points = np.concatenate(
+            [filled[:, :1] - wide, 0.5 * (filled[:, 1:] + filled[:, :-1]), ends + wide], axis=-1
+        )
+        u = (
+            self.offset[members][None]
+            + self.gain[members][None, ..., 0] * points.T[..., None, None]
+        )
+        alive = self.log_factor(members, u)[..., 0].T > -np.inf
+        alive[:, 1:-1] &= np.diff(filled, axis=-1) > 0
+        sides = np.concatenate(
+            [np.full_like(ends, -np.inf), filled, np.full_like(ends, np.inf)], -1
+        )
+        rows = np.arange(len(members))
+        known = (last[:, 0] > 0) & alive.any(axis=-1)
+        low = np.where(known, sides[rows, alive.argmax(axis=-1)], -np.inf)
+        top = alive.shape[1] - alive[:, ::-1].argmax(axis=-1)
+        high = np.where(known, sides[rows, top], np.inf)
+        return low, high
 
     # ---- private -------------------------------------------------------------------------------
 

@@ -14,19 +14,28 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import special
+from scipy import interpolate, special
 
 from bayesmc import distributions as d
 from bayesmc.distributions import Distribution
+from bayesmc.distributions.far_quantiles import beta_lower, gamma_lower, gamma_upper
+from bayesmc.distributions.tails import tails_of
 from bayesmc.distributions.transforms import Transform
 from bayesmc.expression import Constant, Expression, Family, TracedArray, elementwise
 from bayesmc.network import Model
 from bayesmc.network.expressions import Followed, density
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
+#: scores up to which curves are splines, how far their knots are apart, and where splines end in time
+_REACH, _STEP, _MARGIN = 40.0, 0.05, 1.0
+#: by how much splines may be off between knots, of numbers of this size
+_ROUNDING = 1e-11
+#: a score that stands for any farther out
+_FARTHEST = 38.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +60,13 @@ class NormalScores(Transform):
         return self.inverse(u)
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
-        return np.asarray(special.ndtri(self.prior.cdf(x)))
+        tails = tails_of(self.prior)
+        with np.errstate(all="ignore"):
+            below, above = tails.log_cdf(x), tails.log_sf(x)
+            right = special.ndtri_exp(np.minimum(above, 0.0))
+            z = np.where(below < above, special.ndtri_exp(np.minimum(below, 0.0)), -right)
+            # a tail whose probability is no number: the score only has to be far out
+            return np.where(np.isfinite(z), z, np.clip(z, -_FARTHEST, _FARTHEST))
 
     def log_det_formula(self, u: Any) -> Any:
         """``log |dx/dz|``, of arrays."""
@@ -102,36 +117,92 @@ def _single(value: Any) -> Any:
     return array
 
 
-def _gamma(concentration: float, rate: float) -> Callable[[np.ndarray], np.ndarray]:
-    def inverse(z: np.ndarray) -> np.ndarray:
-        low = special.gammaincinv(concentration, special.ndtr(np.minimum(z, 0.0)))
-        high = special.gammainccinv(concentration, special.ndtr(-np.maximum(z, 0.0)))
-        return np.where(z <= 0, low, high) / rate
+class Curve:
+    """A smooth rising function of a normal score, by splines of degree 7 within a reach, else as it is.
 
-    return inverse
+    Inverses of gamma and beta laws take half a microsecond a number, of which lattices ask for millions.
+
+    Parameters
+    ----------
+    exact : callable
+        Of an array.
+    """
+
+    def __init__(self, exact: Callable[[np.ndarray], np.ndarray]) -> None:
+        self.exact = exact
+        self.pieces: Callable[[np.ndarray], np.ndarray] | None = None
+        knots = np.arange(-_REACH, _REACH + 0.5 * _STEP, _STEP)
+        values = exact(knots)
+        if not np.isfinite(values).all():
+            return
+        spline = interpolate.make_interp_spline(knots, values, k=7)
+        pieces = interpolate.PPoly.from_spline(spline)
+        between = knots[(np.abs(knots) < _REACH - _MARGIN)] + 0.5 * _STEP
+        wanted = exact(between)
+        if (np.abs(pieces(between) - wanted) <= _ROUNDING * (1.0 + np.abs(wanted))).all():
+            self.pieces = pieces
+
+    def __call__(self, z: np.ndarray) -> np.ndarray:
+        z = np.asarray(z, dtype=float)
+        if self.pieces is None:  # it turns more sharply than splines follow
+            return self.exact(z)
+        found = np.asarray(self.pieces(z))
+        far = np.abs(z) > _REACH - _MARGIN
+        if far.any():
+            found[far] = self.exact(z[far])
+        return found
+
+
+@lru_cache(maxsize=64)
+def _log_gamma(concentration: float) -> Curve:
+    def exact(z: np.ndarray) -> np.ndarray:
+        low = gamma_lower(concentration, special.log_ndtr(z))
+        high = gamma_upper(concentration, special.log_ndtr(-np.asarray(z)))
+        return np.where(low < np.log(concentration), low, high)
+
+    return Curve(exact)
+
+
+@lru_cache(maxsize=64)
+def _logit_beta(a: float, b: float) -> Curve:
+    def exact(z: np.ndarray) -> np.ndarray:
+        one = beta_lower(a, b, special.log_ndtr(z))
+        other = beta_lower(b, a, special.log_ndtr(-np.asarray(z)))
+        with np.errstate(all="ignore"):
+            low, high = one - np.log1p(-np.exp(one)), np.log1p(-np.exp(other)) - other
+        return np.where(one < np.log(0.5), low, high)
+
+    return Curve(exact)
+
+
+def _gamma(concentration: float, rate: float) -> Callable[[np.ndarray], np.ndarray]:
+    curve = _log_gamma(concentration)
+    return lambda z: np.exp(curve(z)) / rate
 
 
 def _beta(a: float, b: float) -> Callable[[np.ndarray], np.ndarray]:
-    def inverse(z: np.ndarray) -> np.ndarray:
-        low = special.betaincinv(a, b, special.ndtr(np.minimum(z, 0.0)))
-        high = 1.0 - special.betaincinv(b, a, special.ndtr(-np.maximum(z, 0.0)))
-        return np.where(z <= 0, low, high)
-
-    return inverse
+    curve = _logit_beta(a, b)
+    return lambda z: special.expit(curve(z))
 
 
 def _inverse_gamma(concentration: float, scale: float) -> Callable[[np.ndarray], np.ndarray]:
-    upside_down = _gamma(concentration, 1.0)
-    return lambda z: scale / upside_down(-z)
+    curve = _log_gamma(concentration)
+    return lambda z: scale * np.exp(-curve(-np.asarray(z)))
 
 
 def _half_cauchy(scale: float) -> Callable[[np.ndarray], np.ndarray]:
     def inverse(z: np.ndarray) -> np.ndarray:
         low = np.tan(0.5 * np.pi * special.ndtr(np.minimum(z, 0.0)))
-        high = 1.0 / np.tan(0.5 * np.pi * special.ndtr(-np.maximum(z, 0.0)))
+        small = special.log_ndtr(-np.maximum(z, 0.0)) + np.log(0.5 * np.pi)
+        # of small angles the tangent is the angle
+        high = np.where(small < -20.0, np.exp(-small), 1.0 / np.tan(np.exp(small)))
         return scale * np.where(z <= 0, low, high)
 
     return inverse
+
+
+def _half_normal(scale: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda z: -scale * special.ndtri_exp(special.log_ndtr(-z) - np.log(2.0))
 
 
 #: family -> from its parameters the map, rising
@@ -141,7 +212,7 @@ _INVERSES: dict[type, Callable[..., Callable[[np.ndarray], np.ndarray]]] = {
     d.Gamma: _gamma,
     d.InverseGamma: _inverse_gamma,
     d.Beta: _beta,
-    d.HalfNormal: lambda scale: lambda z: -scale * special.ndtri(0.5 * special.ndtr(-z)),
+    d.HalfNormal: _half_normal,
     d.HalfCauchy: _half_cauchy,
     d.LogNormal: lambda loc, scale: lambda z: np.exp(loc + scale * z),
     d.Weibull: lambda k, scale: lambda z: scale * (-special.log_ndtr(-z)) ** (1.0 / k),

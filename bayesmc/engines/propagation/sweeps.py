@@ -14,11 +14,18 @@ import numpy as np
 
 from bayesmc.engines.propagation.batch import Batch, cautious
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs
+from bayesmc.engines.propagation.contradiction import (
+    Bounds,
+    are_squeezed,
+    bounds_of,
+    contradictory,
+    spreads,
+)
+from bayesmc.engines.propagation.lines import LineBatch
+from bayesmc.engines.propagation.pace import Pace
 from bayesmc.engines.propagation.system import System
 from bayesmc.errors import ZeroProbabilityError
 
-#: sweeps after which the change must have shrunk by a factor; else shares do, down to the smallest
-_PATIENCE, _SHRUNK, _SHARE, _LEAST = 8, 0.5, 0.6, 0.02
 #: probabilities below this do not count as changed
 _TINY = 1e-12
 
@@ -71,40 +78,44 @@ def settle(
     """Pass messages until nothing changes, or ``sweeps`` times."""
     beliefs, batches = system.beliefs, system.batches
     order = [*batches, *reversed(batches[:-1])] if len(batches) > 1 else batches
-    share, skipped, left, change, done = 1.0 - damping, 0, 0, np.inf, 0
-    history: list[float] = []
+    pace, skipped, left, change, done = Pace(damping, _is_easy(batches)), 0, 0, np.inf, 0
     skips: list[tuple[Batch, int]] = []
-    step = share
+    step = pace.share
     if not any(b.count for b in batches):
         _refresh(beliefs)
-        return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, share)
+        return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, pace.share)
+    bounds = [b for b in map(bounds_of, batches) if b is not None]
+    room = spreads(bounds, beliefs)
     while done < sweeps:
         before = _marginals(beliefs)
         for batch in batches:
             batch.error = 0.0
-        skips = [(batch, batch.visit(beliefs, share).skipped) for batch in order]
+        skips = [(batch, _visited(batch, beliefs, pace)) for batch in order]
         left = sum(n for _, n in skips)
-        change = _distance(before, _marginals(beliefs))
+        after = _marginals(beliefs)
+        change = _distance(before, after)
         done, skipped = done + 1, skipped + left
         if advance is not None:
             advance()
         # a share of the way leaves the rest of it: what is ahead is judged, not the step
-        step = cautious(share, max(b.error for b in batches))
-        if change <= tolerance * step:
-            # beliefs that rest while messages are open have not settled: shorter moves may yet be proper
-            if not left or (change == 0.0 and share <= _LEAST):
-                break
-            share, history = max(share * _SHARE, _LEAST), []
-            continue
-        history.append(change)
-        if len(history) > _PATIENCE and change > _SHRUNK * history[-1 - _PATIENCE]:
-            share, history = max(share * _SHARE, _LEAST), []
+        step = cautious(pace.share, max(b.error for b in batches))
+        if change > tolerance * step:
+            pace.saw(change, _moved(before, after))
+        # beliefs that rest while messages are open have not settled: shorter moves may yet be proper
+        elif not left or (change == 0.0 and pace.is_slowest):
+            break
+        else:
+            pace.shorten()
     _refuse_impossible(system)
     error = max((b.error for b in batches), default=0.0)
     settled = bool(change <= tolerance * step and not left)
     total = np.nan if left and not settled else _evidence(system)
+    if not settled or np.isnan(total) or are_squeezed(room, spreads(bounds, beliefs)):
+        _refuse_contradictory(bounds)
     silent = _silent([b for b, n in skips if n]) if left else {}
-    return Settled(settled, done, float(change), skipped, left, total, error, share, silent=silent)
+    return Settled(
+        settled, done, float(change), skipped, left, total, error, pace.share, silent=silent
+    )
 
 
 def pass_once(system: System) -> Settled:
@@ -114,6 +125,7 @@ def pass_once(system: System) -> Settled:
         for k in range(batch.count):
             skipped += batch.visit(beliefs, 1.0, np.array([k])).skipped
     _refuse_impossible(system, at_all=True)
+    _refuse_contradictory([b for b in map(bounds_of, system.batches) if b is not None])
     met = system.log_scale + beliefs.log_total + sum(float(b.logs.sum()) for b in system.batches)
     total = np.nan if skipped else _evidence(system)
     error = max((b.error for b in system.batches), default=0.0)
@@ -135,6 +147,22 @@ def _silent(batches: Sequence[Batch]) -> dict[str, int]:
         if count:
             found[batch.name] = found.get(batch.name, 0) + count
     return found
+
+
+def _visited(batch: Batch, beliefs: Beliefs, pace: Pace) -> int:
+    """Visit all factors, rows of one number in as many parts as the pace says; how many were skipped."""
+    parts = min(pace.parts, batch.count) if isinstance(batch, LineBatch) else 1
+    if parts == 1:
+        return batch.visit(beliefs, pace.share).skipped
+    groups = (batch.everyone[k::parts] for k in range(parts))
+    return sum(batch.visit(beliefs, pace.share, group).skipped for group in groups)
+
+
+def _is_easy(batches: Sequence[Batch]) -> bool:
+    """Whether all that is approximated is one batch of log-concave factors, whose messages are never improper
+    (Seeger 2008, JMLR 9, sec. 4)."""
+    inexact = [b for b in batches if not b.is_exact]
+    return len(inexact) == 1 and getattr(inexact[0].kernel, "is_log_concave", False)
 
 
 def _refresh(beliefs: Beliefs) -> None:
@@ -168,14 +196,34 @@ def _distance(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray
         else:
             p, q = (np.maximum(a[0], _TINY) for a in (one, two))
             apart = ((p - q) * np.log(p / q)).sum(axis=-1)
-        worst = max(worst, float(np.nan_to_num(apart, nan=np.inf).max()))
+        most = float(apart.max())  # NaN where any is
+        worst = max(worst, np.inf if np.isnan(most) else most)
     return float(np.sqrt(max(worst, 0.0)))
+
+
+def _moved(before: list[tuple[np.ndarray, ...]], after: list[tuple[np.ndarray, ...]]) -> np.ndarray:
+    """Where a sweep went: of numbers in standard deviations, of the rest in what describes it."""
+    found = []
+    for one, two in zip(before, after, strict=True):
+        step = two[0] - one[0]
+        found.append((step / np.sqrt(two[1]) if len(one) == 2 else step).ravel())
+    return np.concatenate(found)
 
 
 def _evidence(system: System) -> float:
     beliefs = system.beliefs
     parts = [float(b.constants(beliefs).sum()) for b in system.batches if b.count]
     return system.log_scale + beliefs.log_total + sum(parts)
+
+
+def _refuse_contradictory(bounds: Sequence[Bounds]) -> None:
+    names = contradictory(bounds)
+    if names:
+        raise ZeroProbabilityError(
+            "ExpectationPropagation: the evidence has probability zero: what is said by "
+            f"{', '.join(map(repr, names[:6]))} contradicts itself, since no numbers satisfy all of these "
+            "comparisons"
+        )
 
 
 def _refuse_impossible(system: System, at_all: bool = False) -> None:

@@ -103,9 +103,15 @@ def check_bound(before: float, now: float) -> None:
     bayesmc.engines.variational.ascent.BoundError: MeanField: the evidence bound fell ...
     """
     if not now >= before - ROUNDING * max(1.0, 1e-3 * abs(before)):
+        small = before - now < 1e-6 * (1.0 + abs(before))
         raise BoundError(
             f"MeanField: the evidence bound fell from {before!r} to {now!r} in a sweep, which no coordinate "
-            "ascent does; please report this net"
+            "ascent does"
+            + (
+                ": rounding, as of noise that is tiny beside other spreads; give it more, or use Gibbs()"
+                if small
+                else "; please report this net"
+            )
         )
 
 

@@ -51,6 +51,39 @@ def refuse_jumps(plan: Plan, state: State) -> None:
                 )
 
 
+def refuse_edges(plan: Plan, state: State) -> None:
+    """Refuse a density that is zero beyond some values of a free number, where draws of the prior lie.
+
+    A normal factor has mass beyond any edge, where the bound is minus infinity: what it climbs is a sum over
+    a few points, and it shrinks until these are inside.
+
+    Raises
+    ------
+    UnsupportedError
+        Names the node.
+    """
+    free = plan.free
+    if free is None:
+        return
+    root = total_of(s.total for s in plan.sums)
+    rng = np.random.default_rng(free.size)
+    own = {name: value for name, value in state.items() if name != FREE}
+    reached, drawn = _reached(free, rng), _drawn(plan, free, rng)
+    if not len(drawn):
+        return
+    for node in free.nodes:
+        low = reached[rng.integers(len(reached), size=_WAYS)]
+        high = low.copy()
+        numbers = slice(node.start, node.start + node.size)
+        high[:, numbers] = drawn[rng.integers(len(drawn), size=_WAYS)][:, numbers]
+        if jumps_between(root, FREE, own, low, high, to_zero=True).any():
+            raise UnsupportedError(
+                f"MeanField: the density is zero beyond some values of node {node.name!r} (an observed "
+                "comparison, or bounds that depend on other nodes), in front of which a normal factor would "
+                "be squeezed; use ExpectationPropagation(), Gibbs() or HamiltonianMonteCarlo()"
+            )
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 

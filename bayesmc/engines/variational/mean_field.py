@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
 from bayesmc.engines.variational.excluded import left_out
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
-from bayesmc.engines.variational.jumping import refuse_jumps
+from bayesmc.engines.variational.jumping import refuse_edges, refuse_jumps
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
 from bayesmc.engines.variational.places import other_places, told
 from bayesmc.engines.variational.plan import plan_for
@@ -40,6 +40,8 @@ NEVER = -1e250
 _REACH, _DRAWS = 1.6, 2048
 #: sets of fresh points that measure a bound
 _REPEATS = 16
+#: share of even tables in draws that check the others
+_EVEN = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,7 @@ class MeanFieldApproximation:
 
     parts: tuple[Part, ...]
     coordinates: str = "the nodes' own coordinates"
+    tied: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -62,6 +65,13 @@ class MeanFieldApproximation:
             values |= found
             log = log + own
         return Drawn(values, log)
+
+    @property
+    def spread(self) -> Callable[[np.random.Generator, int], Drawn] | None:
+        """Draws that meet the states which tied nodes have left out; None where no nodes are tied."""
+        if not self.tied:
+            return None
+        return replace(self, parts=tuple(_evened(part, self.tied) for part in self.parts)).draw
 
     def part(self, name: str) -> Part | None:
         return next((p for p in self.parts if name in p.names), None)
@@ -294,18 +304,16 @@ class MeanField(Engine):
         where = "the nodes' own coordinates"
         if plan.free is not None:
             where = f"unconstrained numbers of {', '.join(plan.free.names)}"
-        posterior = MeanFieldPosterior(
-            problem, self, MeanFieldApproximation(parts, where), seed, None, self.draws
-        )
+        tied = left_out(plan, best.state)
+        found_by = MeanFieldApproximation(parts, where, tuple(tied))
+        posterior = MeanFieldPosterior(problem, self, found_by, seed, None, self.draws)
         posterior.elbos = np.array(best.bounds) + constant
         posterior.bounds = np.array([a.bounds[-1] for a in found]) + constant
         posterior.elbo, posterior.elbo_mcse = float(posterior.elbos[-1]), 0.0
         if plan.free is not None:
-            refuse_jumps(plan, best.state)
             posterior.elbo, posterior.elbo_mcse = measured(plan, best, rng, constant)
         posterior.log_marginal_likelihood = posterior.elbo
         posterior.sweeps, posterior.converged = len(best.bounds), best.converged
-        tied = left_out(plan, best.state)
         if tied:
             warnings.warn(
                 f"MeanField: zero probabilities tie {', '.join(map(repr, tied[:6]))} to others, and "
@@ -351,6 +359,8 @@ def measured(
     scrambled sequences.
     """
     assert plan.free is not None
+    refuse_jumps(plan, best.state)
+    refuse_edges(plan, best.state)
     free = plan.free
     entropy = sum(f.entropy(best.state) for f in plan.factors) + constant
 
@@ -376,3 +386,13 @@ def measured(
         return found + entropy, abs(found - average(free.points, free.weights))
     each = [average(*fresh_points(free.size, rng)) for _ in range(_REPEATS)]
     return float(np.mean(each)) + entropy, float(np.std(each, ddof=1)) / np.sqrt(_REPEATS)
+
+
+def _evened(part: Part, tied: Sequence[str]) -> Part:
+    """A table of tied nodes with a share of an even one, but for what was seen."""
+    if not isinstance(part, TablePart) or not set(part.names) & set(tied):
+        return part
+    mixed = (1.0 - _EVEN) * part.table + _EVEN / len(part.table)
+    return replace(
+        part, table=mixed if part.seen is None else np.where(part.seen, part.table, mixed)
+    )

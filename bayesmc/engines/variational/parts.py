@@ -29,6 +29,7 @@ from bayesmc.engines.variational.factors import (
     TableFactor,
 )
 from bayesmc.engines.variational.free import FreeFactor
+from bayesmc.errors import UnsupportedError
 from bayesmc.structure.target import Target, Values
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -224,6 +225,7 @@ class TablePart:
     table: np.ndarray
     sizes: tuple[int, ...]
     dtypes: tuple[np.dtype, ...]
+    seen: np.ndarray | None = None
 
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
         levels = np.cumsum(self.table, axis=0)
@@ -270,8 +272,12 @@ class FreePart:
     closed: dict[str, Any] = field(default_factory=dict)
 
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
+        if self.factor is None:
+            raise UnsupportedError(
+                "this approximation was unpickled, and pickles carry no functions; call infer again, or draw "
+                "before pickling"
+            )
         z = rng.standard_normal((draws, len(self.mean)))
-        assert self.factor is not None
         full = self.root.ndim == 2
         u = self.mean + (z @ self.root.T if full else z * self.root)
         diagonal = np.diagonal(self.root) if full else self.root
@@ -335,7 +341,7 @@ def part_of(factor: Factor, state: State, target: Target) -> Part:
     if isinstance(factor, TableFactor):
         domains = [target.model[name].domain for name in factor.names]
         dtypes = tuple(d.dtype for d in domains if d is not None)
-        return TablePart(factor.names, state[factor.table], factor.sizes, dtypes)
+        return TablePart(factor.names, state[factor.table], factor.sizes, dtypes, factor.seen)
     assert isinstance(factor, (ShareFactor, ScatterFactor))
     seen, known = target.seen(factor.own.name), Known()
     if seen is not None and factor.seen is not None:

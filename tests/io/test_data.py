@@ -1,0 +1,98 @@
+"""Data files of JAGS, BUGS, R and Stan."""
+
+from __future__ import annotations
+
+import gzip
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.errors import FileFormatError
+from bayesmc.io.rdump import parse_rdump
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("N <- 3", {"N": 3}),
+        ("`N` <-\n3L; 'x' = -2.5e-1", {"N": 3, "x": -0.25}),
+        ("y <- c(1, NA, -Inf, 2)  # rain", {"y": [1, np.nan, -np.inf, 2]}),
+        ("y <- 3:1\nz <- c(1:3, 7, c(8, 9))", {"y": [3, 2, 1], "z": [1, 2, 3, 7, 8, 9]}),
+        ("y <- -2:2", {"y": [-2, -1, 0, 1, 2]}),
+        ("y <- structure(c(1,2,3,4,5,6), .Dim = c(2L, 3L))", {"y": [[1, 3, 5], [2, 4, 6]]}),
+        ("y <- structure(.Data = c(1,2,3,4,5,6), .Dim = c(2, 3))", {"y": [[1, 3, 5], [2, 4, 6]]}),
+        ("list(N=2, y=structure(.Data=c(1,2,3,4,5,6), .Dim=c(2,3)))", {"N": 2, "y": [[1, 2, 3], [4, 5, 6]]}),
+        ("list(y = structure(c(1,2,3,4), .Dim = c(2,2)))", {"y": [[1, 3], [2, 4]]}),
+        ("none <- integer(0)\nzeros <- numeric(2)", {"none": [], "zeros": [0.0, 0.0]}),
+        ("is <- c(TRUE, FALSE)", {"is": [True, False]}),
+        ("", {}),
+    ],
+)  # fmt: skip
+def test_numbers_of_r(text: str, wanted: dict) -> None:
+    found = parse_rdump(text)
+    assert list(found) == list(wanted)
+    for name, value in wanted.items():
+        np.testing.assert_array_equal(found[name], value)
+    assert all(a.dtype.kind in "ib" for n, a in found.items() if n in ("N", "none", "is"))
+
+
+def test_cubes_run_by_the_first_index_in_r_and_by_the_last_in_bugs() -> None:
+    by_r = parse_rdump("y <- structure(1:24, .Dim = c(2, 3, 4))")["y"]
+    by_bugs = parse_rdump("list(y = structure(.Data = c(1:24), .Dim = c(2, 3, 4)))")["y"]
+    assert by_r[1, 0, 0] == 2 and by_r[0, 0, 1] == 7
+    assert by_bugs[0, 0, 1] == 2 and by_bugs[1, 0, 0] == 13
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "said"),
+    [
+        ("N <- 3\ny <- c(1, 2", 2, "',' is wanted, and the end is there"),
+        ("N 3", 1, "'<-' is wanted after 'N', and '3' is there"),
+        ("y <- factor(c(1))", 1, "factor(...) is not known here"),
+        ("\n\ny <- structure(c(1,2,3), .Dim = c(2,2))", 3, "takes 4 numbers, and 3 are given"),
+        ("y <- 'red'", 1, "a number is wanted, and \"'red'\" is there"),
+        ("y <- 1\ny <- 2", 2, "'y' is given twice"),
+        ("list(1, 2)", 1, "has no name"),
+        ("y <- {1}", 1, "'{' is not expected here"),
+        ("y <- c(1,2):3", 1, "single numbers"),
+        ("y <- NA:3", 1, "single numbers"),
+        ("<- 3", 1, "a name is wanted"),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_line(
+    tmp_path: Path, text: str, line: int, said: str
+) -> None:
+    path = tmp_path / "data.R"
+    path.write_text(text)
+    with pytest.raises(FileFormatError) as caught:
+        bmc.io.read_data(path)
+    assert said in str(caught.value)
+    assert caught.value.line == line
+
+
+def test_json_of_stan(tmp_path: Path) -> None:
+    path = tmp_path / "eight.data.json.gz"
+    text = '{"J": 3, "y": [[1, null], [2.5, "-Infinity"]], "group": [1, 2], "none": []}'
+    path.write_bytes(gzip.compress(text.encode()))
+    found = bmc.io.read_data(path)
+    assert found["J"] == 3 and found["group"].dtype.kind == "i" and found["none"].size == 0
+    np.testing.assert_array_equal(found["y"], [[1, np.nan], [2.5, -np.inf]])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("{\n,", "not JSON"),
+        ("[1, 2]", "holds no names"),
+        ('{"y": [[1, 2], [3]]}', "the rows of 'y' differ in length"),
+        ('{"y": "red"}', "'y' holds something that is no number"),
+        ('{"y": {"a": 1}}', "'y' holds something that is no number"),
+    ],
+)
+def test_json_that_is_none(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "data.json"
+    path.write_text(text)
+    with pytest.raises(FileFormatError, match=said):
+        bmc.io.read_data(path)
