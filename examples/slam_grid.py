@@ -158,7 +158,24 @@ def net(laser: Laser, cell: float = CELL) -> tuple[bmc.DynamicBayesNet, dict[str
 def mapped(
     log: Log, particles: int = PARTICLES, rng: Any = SEED, frames: Sequence[int] = ()
 ) -> Run:
-    """SLAM on a log, scan by scan."""
+    """SLAM on a log, scan by scan.
+
+    Raises
+    ------
+    ValueError
+        Stamps that run backwards, or as many scans as there are not poses.
+    """
+    if not len(log.scans) == len(log.odometry) == len(log.stamps):
+        raise ValueError(
+            f"{log.name}: {len(log.scans)} scans, {len(log.odometry)} poses by the wheels and "
+            f"{len(log.stamps)} stamps; each scan has one of both"
+        )
+    back = np.flatnonzero(np.diff(log.stamps) < 0)
+    if len(back):
+        raise ValueError(
+            f"{log.name}: the stamp of scan {back[0] + 1} is before that of scan {back[0]}; sort the log by "
+            "its stamps"
+        )
     dbn, looking = net(log.laser)
     engine = bmc.ParticleFilter(particles, proposal=looking)
     used = keyframes(log.odometry)

@@ -24,6 +24,8 @@ _CAP = 120
 #: maps that are worked on at a time: their cells stay in cache
 _BLOCK = 32
 _CELLS = TILE * TILE
+#: cells from the origin up to which whole numbers count them
+_FARTHEST = 1e9
 
 
 @dataclass(frozen=True)
@@ -112,6 +114,15 @@ class ScanMapper:
         if not np.isfinite(pose).all():
             raise ParameterError("ScanMapper: a pose is not finite")
         scans = as_scans("ScanMapper", self.laser, ranges)
+        if (
+            pose.size
+            and maps.size
+            and np.abs(pose[..., :2]).max() > _FARTHEST * maps.flat[0].resolution
+        ):
+            raise ParameterError(
+                "ScanMapper: a pose is more than a thousand million cells from the origin of the map; "
+                "are positions in metres, and did the robot start near the origin?"
+            )
         shape = broadcast_shapes(maps.shape, pose.shape[:-1], scans.shape[:-1])
         found = np.empty(math.prod(shape), dtype=object)
         olds = np.broadcast_to(maps, shape).reshape(-1)
