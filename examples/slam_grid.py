@@ -51,7 +51,7 @@ from bayesmc.robotics import (
 from examples import picture, reference, robot_logs
 
 SEED, PARTICLES, CELL = 1, 30, 0.05  # cells in m
-APART, TURNED = 0.2, 0.15  # m and rad between scans that are used
+APART, TURNED = 0.1, 0.05  # m and rad between scans that are used
 FRAMES = 60  # of the animation
 QUICK = 60  # scans with --fast
 
