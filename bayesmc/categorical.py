@@ -18,6 +18,8 @@ from bayesmc.errors import ZeroProbabilityError
 
 #: columns up to which rows are compared one column at a time, and states up to which sums go one by one
 _COLUMNS, _STATES = 16, 64
+#: and of arrays whose last axis is that of the states
+_SHORT = 8
 
 
 def log_sum_exp(log: np.ndarray, axis: Any = None) -> Any:
@@ -31,6 +33,8 @@ def log_sum_exp(log: np.ndarray, axis: Any = None) -> Any:
     [-2000.288, -2000.981]
     """
     with np.errstate(divide="ignore", invalid="ignore"):
+        if axis == -1 and log.ndim > 1 and 0 < log.shape[-1] <= _SHORT:
+            log, axis = np.moveaxis(log, -1, 0), 0
         if axis == 0 and 0 < len(log) <= _STATES:
             top = _largest(log)
             top = np.where(np.isfinite(top), top, 0.0)

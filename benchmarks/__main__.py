@@ -18,6 +18,7 @@ from benchmarks import (
     bench_slam,
     bench_switching,
     bench_time,
+    bench_vision,
     bench_weighting,
     prices,
 )
@@ -57,3 +58,5 @@ if __name__ == "__main__":
         bench_robot_logs.main()
         print()
         bench_slam.main(())
+        print()
+        bench_vision.main()

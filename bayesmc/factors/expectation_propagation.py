@@ -3,7 +3,10 @@
 A product of factors over variables is approximated by a product of messages, one from every factor to every
 variable in its scope. A visit takes the factor's own messages out of the beliefs about its variables (what is
 left are the cavities), multiplies the factor itself in, keeps the moments of the result for each variable,
-and divides the cavity out again: that is the new message. Improper results are left out and counted.
+and divides the cavity out again: that is the new message. Quotients need not have a finite integral, and a
+factor may have none with its cavities: then the messages that other factors have sent since it last had one
+are taken back, half-way and again (a line search), and where that does not help its own are left as they are.
+Both are counted.
 
 References
 ----------
@@ -16,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -74,9 +78,11 @@ class Propagated:
     change : ndarray, shape lead
         By how much the belief that changed most did so in the last sweep (``Message.distance``).
     skipped : ndarray of int, shape lead
-        Improper messages that were left out, in all sweeps.
+        Improper messages that were left out or taken back in part, in all sweeps.
     open : ndarray of int, shape lead
         Those of the last sweep.
+    damping : ndarray, shape lead
+        In the last sweep.
     converged : ndarray of bool, shape lead
         Whether the last sweep changed no belief by more than the tolerance, and left nothing out.
     """
@@ -89,6 +95,7 @@ class Propagated:
     change: np.ndarray
     skipped: np.ndarray
     open: np.ndarray
+    damping: np.ndarray
     converged: np.ndarray
 
     def log_total(self, factors: Sequence[Factor]) -> np.ndarray:
@@ -111,7 +118,7 @@ def propagate(
     visits: Sequence[Visit],
     *,
     sweeps: int,
-    damping: float = 0.0,
+    damping: float | None = 0.0,
     tolerance: float = 1e-6,
     advance: Callable[[], None] | None = None,
 ) -> Propagated:
@@ -128,10 +135,11 @@ def propagate(
         One sweep.
     sweeps : int
         At most so many.
-    damping : float
-        Share of the old message that is kept, in natural parameters; 0 keeps none.
+    damping : float or None
+        Share of the old message that is kept, in natural parameters; 0 keeps none. With None it begins with
+        little, and grows for each problem by itself while that does not come closer.
     tolerance : float
-        See ``Propagated.converged``.
+        See ``Propagated.converged``; of a damped sweep its share, as the rest of the way is still ahead.
     advance : callable, optional
         Called after every sweep.
 
@@ -161,57 +169,122 @@ def propagate(
     >>> float(np.exp(found.log_total(pairs)).round(6))  # 4 * 6 + 3 * 2
     30.0
     """
-    state = _State(priors, factors, [list(s) for s in sites], 1.0 - damping)
+    state = _State(priors, factors, [list(s) for s in sites])
     lead = np.shape(state.beliefs[0].log_total)
+    pace = _Pace.of(lead, damping)
     skipped = out = np.zeros(lead, dtype=int)
-    change = np.full(lead, np.inf)
-    done = 0
-    while done < sweeps and not (change <= tolerance).all():  # what is left out then, stays out
+    change, done = np.full(lead, np.inf), 0
+    rests = np.zeros(lead, dtype=bool)
+    while done < sweeps and not rests.all():
         before, out = list(state.beliefs), np.zeros(lead, dtype=int)
+        state.share = pace.share
         for visit in visits:
             out = out + state.visited(visit)
         moved = [b.distance(a) for a, b in zip(before, state.beliefs, strict=True)]
         change, skipped, done = np.max(moved, axis=0), skipped + out, done + 1
+        rests = change <= tolerance * state.share
+        if pace.grows:  # what is left out may be in place once steps are shorter
+            rests &= (out == 0) | (state.share <= _LEAST)
+            pace = pace.after(change, out)
         if advance is not None:
             advance()
     totals = state.normalise()
     cavities = [state.cavities(f) for f in range(len(factors))]
     logs = [f.tilted(c, ()).log for f, c in zip(factors, cavities, strict=True)]
-    settled = (change <= tolerance) & (out == 0)
+    settled = (change <= tolerance * state.share) & (out == 0)
     beliefs = [b.normalised() for b in state.beliefs]
     return Propagated(
         beliefs, cavities, np.reshape(logs, (len(factors), *lead)), totals,
-        done, change, skipped, out, settled,
+        done, change, skipped, out, 1.0 - state.share, settled,
     )  # fmt: skip
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
+#: sweeps that are looked back over; rises of the change in them from which on it goes to and fro
+_PATIENCE, _RISES = 8, 3
+#: what becomes of the share where changes grow, or go to and fro and do not halve; and where none rises
+_CUT, _GROWN, _LEAST = 0.5, 1.25, 0.02
+#: share of the new message that a search for damping begins with
+_BOLD = 0.8
+#: times that messages are taken back half-way, before all of the way
+_HALVED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class _Pace:
+    """Which share of new messages is taken, problem by problem.
+
+    Attributes
+    ----------
+    share : ndarray, shape lead
+    grows : bool
+        Whether damping grows while changes do not get smaller.
+    since : ndarray of int, shape lead
+        Sweeps since the share changed.
+    history : tuple of ndarray
+        The last changes.
+    """
+
+    share: np.ndarray
+    grows: bool
+    since: np.ndarray
+    history: tuple[np.ndarray, ...] = ()
+
+    @classmethod
+    def of(cls, lead: tuple[int, ...], damping: float | None) -> _Pace:
+        share = _BOLD if damping is None else 1.0 - damping
+        return cls(np.full(lead, share), damping is None, np.zeros(lead, dtype=int))
+
+    def after(self, change: np.ndarray, out: np.ndarray) -> _Pace:
+        """With what a sweep did."""
+        history = (*self.history, np.where(out > 0, np.inf, change))[-1 - _PATIENCE :]
+        since = self.since + 1
+        ready = since > _PATIENCE
+        rises = sum(np.greater(b, a) | ~np.isfinite(b) for a, b in pairwise(history))
+        ratio = history[-1] > 0.5 * history[0]
+        worse = ~(history[-1] < history[0]) | (ratio & (rises >= _RISES))
+        share = np.where(worse, _CUT, np.where(rises == 0, _GROWN, 1.0)) * self.share
+        share = np.minimum(share, 1.0)
+        share = np.where(ready, np.maximum(share, _LEAST), self.share)
+        return _Pace(share, True, np.where(ready, 0, since), history)
+
+
 class _State:
     """Messages, and the beliefs that they make."""
 
     def __init__(
-        self,
-        priors: Sequence[Any],
-        factors: Sequence[Factor],
-        sites: list[list[Any]],
-        share: float,
+        self, priors: Sequence[Any], factors: Sequence[Factor], sites: list[list[Any]]
     ) -> None:
-        self.priors, self.factors, self.sites, self.share = priors, factors, sites, share
+        self.priors, self.factors, self.sites = priors, factors, sites
+        self.share: np.ndarray = np.ones(())
         self.around: list[list[tuple[int, int]]] = [[] for _ in priors]
         for f, factor in enumerate(factors):
             for end, place in enumerate(factor.scope):
                 self.around[place].append((f, end))
         self.beliefs = [self._product(place, None) for place in range(len(priors))]
+        #: for every factor the messages of others with which it last had an integral
+        self.fine = [
+            {at: sites[at[0]][at[1]] for at in self._others(f)} for f in range(len(factors))
+        ]
 
     def visited(self, visit: Visit) -> np.ndarray:
-        """How many messages were left out, shape lead."""
+        """How many messages were left out or taken back, shape lead."""
         factor, own = self.factors[visit.factor], self.sites[visit.factor]
         cavities = self.cavities(visit.factor)
         found = factor.tilted(cavities, visit.ends)
         fine = np.isfinite(found.log)
         out = np.where(fine, 0, len(visit.ends))
+        for halved in range(_HALVED + 1):
+            if fine.all() or not self.fine[visit.factor]:
+                break
+            self._take_back(visit.factor, fine, 0.5 if halved < _HALVED else 0.0)
+            cavities = self.cavities(visit.factor)
+            found = factor.tilted(cavities, visit.ends)
+            fine = np.isfinite(found.log)
+        for at, last in self.fine[visit.factor].items():
+            self.fine[visit.factor][at] = self.sites[at[0]][at[1]].where(fine, last)
         if not fine.any():
             return out
         for end, belief in zip(visit.ends, found.beliefs, strict=True):
@@ -234,6 +307,21 @@ class _State:
     def cavities(self, f: int) -> list[Any]:
         """Of a factor, without its own messages."""
         return [self._product(place, (f, end)) for end, place in enumerate(self.factors[f].scope)]
+
+    def _take_back(self, f: int, fine: np.ndarray, share: float) -> None:
+        """Have others' messages go back towards those with which a factor last had an integral."""
+        for (g, end), last in self.fine[f].items():
+            now = self.sites[g][end]
+            if now is last:
+                continue
+            back = last.towards(now, np.full(np.shape(fine), share)) if share else last
+            self.sites[g][end] = now.where(fine, back)
+        for place in self.factors[f].scope:
+            self.beliefs[place] = self._product(place, None)
+
+    def _others(self, f: int) -> list[tuple[int, int]]:
+        """Messages of other factors to the variables of one."""
+        return [at for place in self.factors[f].scope for at in self.around[place] if at[0] != f]
 
     def _product(self, place: int, without: tuple[int, int] | None) -> Any:
         """Of a variable's messages but one: nothing is divided out, so large messages hide no small ones."""

@@ -33,8 +33,8 @@ class Message(ABC):
         """The quotient; ``otherwise`` stands where both are zero."""
 
     @abstractmethod
-    def towards(self, other: Any, share: float) -> Any:
-        """A geometric mean: ``other`` counts by ``share``. What is zero in one of them is zero."""
+    def towards(self, other: Any, share: Any) -> Any:
+        """A geometric mean: ``other`` counts by ``share``, shape lead. What is zero in one of them is so."""
 
     @abstractmethod
     def scaled(self, log: np.ndarray) -> Any:
@@ -154,16 +154,19 @@ class ConditionalGaussian(Message):
         found = ConditionalGaussian(log, *_without(none, *parts))
         return found._where(~open_, otherwise)
 
-    def towards(self, other: ConditionalGaussian, share: float) -> ConditionalGaussian:
-        if share == 1.0:
+    def towards(self, other: ConditionalGaussian, share: Any) -> ConditionalGaussian:
+        share = np.asarray(share, dtype=float)
+        if (share == 1.0).all():
             return other
-        kept = 1.0 - share
-        log = kept * self.log + share * other.log
-        parts = (
-            kept * a + share * b
-            for a, b in ((self.linear, other.linear), (self.precision, other.precision))
+        log, linear, precision = (
+            (1.0 - s) * a + s * b
+            for s, a, b in (
+                (share, self.log, other.log),
+                (share[..., None], self.linear, other.linear),
+                (share[..., None, None], self.precision, other.precision),
+            )
         )
-        return ConditionalGaussian(log, *_without(log == -np.inf, *parts))
+        return ConditionalGaussian(log, *_without(log == -np.inf, linear, precision))
 
     def scaled(self, log: np.ndarray) -> ConditionalGaussian:
         return ConditionalGaussian(self.log + log, self.linear, self.precision)

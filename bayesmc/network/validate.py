@@ -180,8 +180,7 @@ def _compare_entries(
         part: Any = (*at, Ellipsis)  # an array still, of objects too
         alone = _signature_at(node, entry(node, values, shape, full))
         if whole.family != alone.family or not all(
-            nearly_equal(a[part], b)
-            for a, b in zip(whole.arrays, alone.arrays, strict=True)
+            nearly_equal(a[part], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
         ):
             raise BroadcastError(_broadcast_message(node, at, whole, alone))
 

@@ -524,26 +524,6 @@ def test_bad_parameters_at_a_possible_state_are_told() -> None:
         )
 
 
-def test_of_the_past_tables_say_nothing() -> None:
-    """By name they are refused; "auto" then samples finite nodes, as without it."""
-    dbn, rows = ring(4, 0.1), {"reading": [1, 0, 1]}
-    named = bmc.ParticleFilter(100, marginalize=["color"])
-    for options in ({}, {"lag": 1}):
-        with pytest.raises(
-            UnsupportedError, match="names 'color', and tables of finite nodes tell"
-        ):
-            bmc.smooth(dbn, rows, engine=named, rng=0, **options)
-        both = [
-            bmc.smooth(dbn, rows, engine=bmc.ParticleFilter(100, **own), rng=0, **options)
-            for own in ({"marginalize": "auto"}, {})
-        ]
-        assert np.array_equal(*(found.probabilities("color") for found in both))
-    nodes = bmc.explain(
-        dbn, rows, engine=bmc.ParticleFilter(100, marginalize="auto"), question="smooth"
-    ).nodes
-    assert nodes["color"] == "sampled given its parents"
-
-
 def test_places_where_no_particle_is_are_looked_after_by_scouts() -> None:
     """A jump of one in a thousand, which readings show: who missed it says that nothing is known."""
     dbn = ring(8)

@@ -11,7 +11,8 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc import ExpectationPropagation, SwitchingKalmanFilter
-from bayesmc.errors import ConvergenceWarning, UnsupportedError
+from bayesmc.auto import switching
+from bayesmc.errors import ConvergenceWarning, EngineWarning, UnsupportedError
 from bayesmc.testing import exact, session
 from bayesmc.testing.makers.switching_dbns import random_switching_dbn
 from tests.engines.test_switching import answered, figures, finite, off, read, rows_of, template
@@ -128,17 +129,75 @@ def test_what_does_not_settle_is_a_warning_that_says_by_how_much(reference_data:
     """The last model of the suite, whose messages become improper."""
     held = read(reference_data, "slds_suite")[-1]
     dbn, rows = template(held["model"]), rows_of(held["y"])
-    with pytest.warns(ConvergenceWarning, match="have not settled .* left out . improper messages"):
-        found = bmc.smooth(dbn, rows, engine=EP)
-    assert not found.converged and found.skipped > 0
-    assert np.isnan(found.log_marginal_likelihood)
-    assert np.isfinite(found.mean("x")).all() and np.isfinite(found.probabilities("s")).all()
+    for damping in (0.0, 0.2):
+        with pytest.warns(ConvergenceWarning, match="have not settled .* changed a belief by"):
+            found = bmc.smooth(dbn, rows, engine=ExpectationPropagation(damping=damping))
+        assert not found.converged and found.skipped > 0
+        assert np.isfinite(found.mean("x")).all() and np.isfinite(found.probabilities("s")).all()
+    with pytest.warns(ConvergenceWarning, match="settled, but .* taken back .* far off"):
+        found = bmc.smooth(dbn, rows, engine=EP)  # which finds a damping with which they settle
+    assert found.converged and found.damping > 0.2
+    wrong = np.abs(found.probabilities("s")[1:] - held["smoothed_mode"]).mean()
+    kim = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter()).probabilities("s")[1:]
+    assert wrong < np.abs(kim - held["smoothed_mode"]).mean()
     engine = ExpectationPropagation(damping=0.7, sweeps=400)
     steady = bmc.smooth(dbn, rows, engine=engine)
     assert steady.converged and np.isfinite(steady.log_marginal_likelihood)
     with pytest.warns(ConvergenceWarning, match="changed a belief by"):
         short = bmc.smooth(dbn, rows, engine=ExpectationPropagation(sweeps=2, damping=0.7))
     assert short.sweeps == 2 and short.change > 1e-5
+
+
+def test_smooth_without_an_engine_passes_messages_or_says_that_it_is_kims_answer() -> None:
+    """Two numbers, of which no grid is made; by exact conditioning Kim's smoother is off by .08."""
+    follow = [[0.95, 0.05], [0.2, 0.8]]
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("s", ["s_prev"], follow, initial=[0.8, 0.2])
+    dbn.add(
+        "v", lambda v_prev, s: bmc.Normal(0.9 * v_prev, 0.05 + 0.45 * s), initial=bmc.Normal(0, 1)
+    )
+    dbn.add(
+        "x", lambda x_prev, v, s: bmc.Normal(x_prev + v, 0.1 + 0.9 * s), initial=bmc.Normal(0, 1)
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 0.3))
+    rows = {"y": [0.1, 0.0, 0.3, None, 2.6, 1.1]}
+    found, kim = (bmc.smooth(dbn, rows, engine=e) for e in (None, SwitchingKalmanFilter()))
+    right = bmc.infer(dbn, rows, engine=bmc.Exact())
+    assert found.converged
+    wrong, before = (
+        max(
+            np.abs(f.probabilities("s")[t] - right.probabilities(f"s[{t}]")).max() for t in range(6)
+        )
+        for f in (found, kim)
+    )
+    assert wrong < 0.02 and wrong < 0.3 * before, (wrong, before)
+    exact_tell = bmc.DynamicBayesNet()  # messages about x would be infinite
+    exact_tell.table("s", ["s_prev"], follow, initial=[0.5, 0.5])
+    exact_tell.add("x", lambda x_prev, s: bmc.Normal(x_prev + s, 0.5), initial=bmc.Normal(0.0, 1.0))
+    exact_tell.add("z", lambda z_prev: bmc.Normal(z_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    exact_tell.add(
+        "y", lambda x_prev: bmc.Normal(x_prev, 0.0), initial=lambda x: bmc.Normal(x, 1.0)
+    )
+    with pytest.warns(EngineWarning, match="SwitchingKalmanFilter answers .*without noise"):
+        found = bmc.smooth(exact_tell, {"y": [0.1, 0.3, 0.2]})
+    assert np.isfinite(found.mean("x")).all()
+
+
+def test_long_series_are_kims_by_default_and_explain_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The price is counted before anything is passed."""
+    dbn, rows = jumping(), {"y": np.zeros(30)}
+    dbn.add("z", lambda z_prev: bmc.Normal(z_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    assert "ExpectationPropagation(sweeps=200" in str(bmc.explain(dbn, rows, question="smooth"))
+    monkeypatch.setattr(switching, "_BUDGET", 1000)
+    assert "ExpectationPropagation(sweeps=32" in str(bmc.explain(dbn, rows, question="smooth"))
+    monkeypatch.setattr(switching, "_BUDGET", 300)
+    told = bmc.explain(dbn, rows, question="smooth")
+    assert isinstance(told.engine, SwitchingKalmanFilter)
+    assert "30 slices would take too long" in told.refused["ExpectationPropagation"]
+    for question in ("filter", "fixed-lag"):
+        assert isinstance(bmc.explain(dbn, rows, question=question).engine, SwitchingKalmanFilter)
 
 
 def test_real_gnp_as_particles_have_it(reference_data: Path) -> None:
@@ -389,6 +448,19 @@ def test_what_it_cannot_do_is_refused_by_name() -> None:
     guarded.add("y", lambda x, s: bmc.Normal(x + s, 1.0))
     why = EP.unsupported(guarded, {"y": [0.0, 1.0]})
     assert why is not None and why.startswith("ExpectationPropagation: ")
+
+
+def test_families_are_of_nets_and_refused_over_time() -> None:
+    engine = ExpectationPropagation(families={"x": "normal"})
+    with pytest.raises(UnsupportedError, match=r"families=.*over time"):
+        bmc.smooth(jumping(), {"y": [0.1]}, engine=engine)
+
+
+def test_errors_that_are_not_of_chance_are_not_told_to_be_none() -> None:
+    rows = {"y": [0.1, 0.4]}
+    for engine in (EP, SwitchingKalmanFilter()):
+        assert bmc.smooth(jumping(), rows, engine=engine).mcse("x") is None
+        assert bmc.filter(jumping(), rows, engine=engine).mcse("s") is None
 
 
 def test_numbers_that_later_rows_tell_exactly_are_refused() -> None:

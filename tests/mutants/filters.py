@@ -361,7 +361,7 @@ MUTANTS = [
     Mutant(
         "beliefs along smoothed paths are those of the filter",
         (Edit("bayesmc.engines.marginal.smoothing:_Paths.believed",
-              "combined(messages[k], filtered)", "filtered"),),
+              "combined(messages[k].numbers, filtered)", "filtered"),),
         slices(bmc.smooth, driven, MILD, bmc.ParticleFilter(100, marginalize="auto"), 25),
         "repeated_test of smooth, 25 runs of 100 particles",
     ),

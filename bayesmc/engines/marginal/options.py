@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -10,12 +11,16 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked
 from bayesmc.engines.marginal.choices import MOST
+from bayesmc.engines.marginal.elements.filter import ElementStep
+from bayesmc.engines.marginal.elements.guides import why_not_guided
+from bayesmc.engines.marginal.elements.plan import ElementPlan, element_plan
 from bayesmc.engines.marginal.smoothing import why_not_backwards
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.marginal.tables.step import refuse_seen_in_part
 from bayesmc.engines.marginal.tables.telling import tables_told
 from bayesmc.engines.particles.layers import endless
-from bayesmc.engines.slice_steps import SliceProposals, plates_apart
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
 _SEEN = "observed, weights the particles by its predictive density"
@@ -27,6 +32,79 @@ FEW = 8.0
 PAST = ("smooth", "fixed-lag")
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
+
+
+def marginal_step(
+    engine: Any,
+    split: Split,
+    slices: Slices,
+    static: Mapping[str, np.ndarray],
+    scheme: Any,
+    threshold: float,
+    kept: Any,
+    asked: SliceProposals | None,
+) -> MarginalStep:
+    """The step of a filter that integrates out: by element where elements are proven independent."""
+    plan = SlicePlan(slices, plates_apart(slices), static)
+    given = plan, split, engine.particles, scheme, threshold, kept, asked
+    elements = elements_of(slices, split, asked)
+    if elements is None:
+        return MarginalStep(*given)
+    guided = None
+    if asked is None:
+        guided, is_wrong = guided_node(slices, split, elements)
+        if is_wrong:
+            return MarginalStep(*given)
+    return ElementStep(*given, elements, guided)
+
+
+def elements_of(slices: Slices, split: Split, asked: SliceProposals | None) -> ElementPlan | None:
+    """What is integrated out element by element, where that pays; else None."""
+    if not split.inner:
+        return None
+    proposed = () if asked is None else [n for p in (*asked.first, *asked.later) for n in p.names]
+    key = (split, tuple(proposed))
+    kept = slices.later.cache.setdefault("elements", {})
+    if key not in kept:
+        found = element_plan(
+            slices, split.inner, split.seen, split.linearised, plates_apart(slices), proposed
+        )
+        pays = found is not None and (found.is_picked or found.still or bool(split.linearised))
+        kept[key] = found if pays else None
+    return kept[key]
+
+
+def elements_asked(engine: Any, slices: Slices, split: Split) -> ElementPlan | None:
+    """What this engine integrates out element by element, if anything."""
+    asked = None if engine.proposal == "optimal" else engine._proposals(slices)
+    elements = elements_of(slices, split, asked)
+    if elements is not None and asked is None and guided_node(slices, split, elements)[1]:
+        return None
+    return elements
+
+
+def drawn_by_element(
+    engine: Any, slices: Slices, split: Split, elements: ElementPlan, name: str, plain: str
+) -> str:
+    """What is done to a sampled node beside elements."""
+    if name in elements.pickers:
+        return "sampled given what it picks and the reading"
+    if engine.proposal == "optimal" and guided_node(slices, split, elements)[0] == name:
+        return "sampled given the slice before and the row, made linear in it"
+    return plain
+
+
+def guided_node(slices: Slices, split: Split, elements: ElementPlan) -> tuple[str | None, bool]:
+    """The sampled vector that is drawn with a look at readings of elements, and whether that cannot be.
+
+    Finite nodes that pick are drawn so anyhow; others are not, by element.
+    """
+    free = [n for n in slices.stochastic if n not in split.seen and n not in split.waiting]
+    free = [n for n in free if n not in elements.pickers]
+    if any(slices.later[n].domain is not None for n in free):
+        return None, True
+    fits = [n for n in free if why_not_guided(slices, elements, n) is None]
+    return (fits[0], False) if len(fits) == 1 else (None, bool(free))
 
 
 def read_marginalize(engine: Any) -> Any:
@@ -80,12 +158,12 @@ def split_of_problem(engine: Any, problem: SeriesProblem) -> Split | None:
     return split_asked(engine, problem.slices, problem.known_static, problem.seen)
 
 
-def without_tables(engine: Any, what: str) -> Any:
-    """The same engine without tables of finite nodes where a question is about the past: they know none."""
+def asking(engine: Any, what: str) -> Any:
+    """The same engine as it answers a question about the past: it may integrate out less there."""
     if what not in PAST or getattr(engine, "marginalize", None) is None:
         return engine
     found = object.__new__(type(engine))
-    found.__dict__.update(engine.__dict__, tabled=False)
+    found.__dict__.update(engine.__dict__, question=what)
     return found
 
 
@@ -94,7 +172,7 @@ def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | Non
     if what not in PAST:
         return None
     try:
-        split_of_problem(without_tables(engine, what), problem)
+        split_of_problem(asking(engine, what), problem)
     except UnsupportedError as error:
         return f"ParticleFilter: {error}"
     return None
@@ -119,6 +197,9 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     slices = problem.slices
     sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.waiting]
     if engine.proposal == "optimal":
+        elements = elements_of(slices, split, None)
+        if elements is not None and not guided_node(slices, split, elements)[1]:
+            return None
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:
             return (
@@ -161,6 +242,20 @@ def is_worth_it(engine: Any, problem: SeriesProblem) -> bool:
     return bool(split.inner) or (split.tables is not None and split.tables.joint > FEW)
 
 
+def numbers_carried(engine: Any, problem: SeriesProblem) -> float:
+    """Of a particle: entries of its tables, and of the roots of its covariances."""
+    split = None if engine.marginalize is None else split_of_problem(engine, problem)
+    if split is None:
+        return 0.0
+    slices = problem.slices
+    sizes = [np.prod(slices.later[n].value_shape) for n in split.inner]
+    apart = math.prod(slices.first.sizes[p] for p in blocks_of(slices, split))
+    found = float(sum(sizes)) ** 2 / max(apart, 1)
+    if split.tables is not None:
+        found += sum(g.elements * g.states for g in split.tables.groups)
+    return found
+
+
 def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Why this engine is taken, where something is integrated out."""
     split = split_of_problem(engine, problem)
@@ -173,7 +268,7 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
 
 def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
     """Computed nodes that keep trajectories from being drawn backwards: none that is integrated out."""
-    split = split_of_problem(without_tables(engine, PAST[0]), problem)
+    split = split_of_problem(asking(engine, PAST[0]), problem)
     if split is not None and why_not_backwards(problem.slices, split) is None:
         return ()
     return endless(problem.slices, problem.seen)
@@ -181,14 +276,17 @@ def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
 
 def back(engine: Any, problem: SeriesProblem, asked: Asked) -> str:
     """How smoothing is done, where something is integrated out."""
-    split = split_of_problem(without_tables(engine, asked.what), problem)
+    split = split_of_problem(asking(engine, asked.what), problem)
     if split is None or asked.what not in PAST:
         return ""
+    own = " and ".join(
+        ["a Kalman smoother"] * bool(split.inner) + ["smoothed tables"] * (split.tables is not None)
+    )
     if asked.what == "fixed-lag":
-        return "a Kalman smoother along the ancestors of each particle"
+        return f"{own} along the ancestors of each particle"
     why = why_not_backwards(problem.slices, split)
     if why is None:
-        return "paths of what is sampled drawn backwards, a Kalman smoother along each"
+        return f"paths of what is sampled drawn backwards, {own} along each"
     return f"trajectories of all nodes drawn backwards: nothing stays integrated out, as {why}"
 
 
@@ -203,6 +301,11 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
         each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
+    elements = elements_asked(engine, slices, split)
+    if elements is not None:
+        lead = " and ".join(map(repr, elements.plates))
+        how = "where it is read" if elements.still else "all of which move"
+        each = f"a Kalman filter for each particle and element of {lead}, {how}"
     for name in slices.dynamic:
         if name in split.inner:
             found[name] = f"integrated out, {each}"
@@ -212,7 +315,9 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
             found[name] = _SEEN
         else:
             drawn = name in slices.stochastic and name not in problem.seen
-            if drawn and engine.proposal == "optimal":
+            if drawn and elements is not None:
+                found[name] = drawn_by_element(engine, slices, split, elements, name, found[name])
+            elif drawn and engine.proposal == "optimal":
                 found[name] = "sampled given the slice before and the row"
             if name in split.why:
                 found[name] += f"; not integrated out: {split.why[name]}"
@@ -243,5 +348,23 @@ def _whole(
 ) -> Split:
     """What is integrated out, though it be nothing."""
     known = frozenset(n for n in slices.stochastic if n in seen)
-    tabled = getattr(engine, "tabled", True) and not getattr(engine, "delay", None)
-    return split_of(slices, known, engine.marginalize, static, tabled)
+    what = "fixed-lag" if getattr(engine, "delay", None) else engine.question
+    found = split_of(slices, known, engine.marginalize, static)
+    why = _why_untabled(slices, found, what)
+    return found if why is None else split_of(slices, known, engine.marginalize, static, why)
+
+
+def _why_untabled(slices: Slices, split: Split, what: str) -> str | None:
+    """Why what is asked about the past is not answered from tables, or None."""
+    if split.tables is None or what not in PAST:
+        return None
+    if what == "smooth":
+        return why_not_backwards(slices, split)
+    late = split.waiting - frozenset(split.names)
+    if not late:
+        return None
+    name = next(n for n in slices.dynamic if n in late)
+    return (
+        f"{name!r} is computed from them, or missing, and what a particle has of it was drawn before later "
+        "rows came"
+    )

@@ -27,7 +27,7 @@ smoothing algorithms, Ann. Statist. 51 (moves from the ancestor).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -45,6 +45,16 @@ from bayesmc.engines.marginal.messages import (
 from bayesmc.engines.marginal.reading import Values
 from bayesmc.engines.marginal.split import Split, layouts_of
 from bayesmc.engines.marginal.step import seen_of
+from bayesmc.engines.marginal.tables.afterwards import drawn_afterwards
+from bayesmc.engines.marginal.tables.backwards import (
+    Along,
+    along,
+    log_evidence_of,
+    nothing_after,
+    pulled_tables,
+    told_by,
+)
+from bayesmc.engines.marginal.tables.step import Known
 from bayesmc.engines.particles.layers import carried_on
 from bayesmc.engines.particles.smc import Layout, Particles, evenly_weighted
 from bayesmc.engines.slice_steps import plates_apart
@@ -107,7 +117,7 @@ class MarginalBackward:
         paths: _Paths,
         k: int,
         values: Mapping[str, np.ndarray],
-        message: Message,
+        message: _Later,
         parents: np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
@@ -152,6 +162,17 @@ def why_not_backwards(slices: Slices, split: Split) -> str | None:
 # ---- private ------------------------------------------------------------------------------------
 
 
+class _Later(NamedTuple):
+    """What rows after a slice say of it, for every path: of its numbers, and of finite nodes."""
+
+    numbers: Message
+    states: tuple[np.ndarray, ...]
+
+    def taken(self, index: np.ndarray) -> _Later:
+        """Of some paths."""
+        return _Later(self.numbers.taken(index), tuple(m.take(index, axis=0) for m in self.states))
+
+
 class _Paths:
     """What there is between slices of a filter.
 
@@ -161,24 +182,24 @@ class _Paths:
     filtered : sequence of Particles
         Of slices in a row.
     series : Series
-    first : int
-        The number of the first one's row.
     """
 
-    def __init__(
-        self, step: Any, filtered: Sequence[Particles], series: Series, first: int = 0
-    ) -> None:
-        self.step, self.filtered, self.series, self.first = step, filtered, series, first
+    def __init__(self, step: Any, filtered: Sequence[Particles], series: Series) -> None:
+        self.step, self.filtered, self.series = step, filtered, series
         self._crossing: dict[Any, tuple[list[Step], bool]] = {}
 
-    def silence(self, count: int) -> Message:
+    def silence(self, count: int) -> _Later:
         """What is said to the last slice."""
-        layout = self.filtered[-1].inner.layout
-        return silence(count, layout.lead, layout.carried)
+        layout, tables = self.filtered[-1].inner.layout, self.step.tables
+        own = () if tables is None else nothing_after(tables, count)
+        return _Later(silence(count, layout.lead, layout.carried), own)
 
     def sampled(self, here: Particles) -> dict[str, np.ndarray]:
         """Values that particles of a slice have, but for those that are integrated out."""
-        return {n: v for n, v in here.values.items() if n not in here.inner.layout.rows}
+        split, out = self.step.split, set(here.inner.layout.rows)
+        if split.tables is not None:
+            out |= split.waiting - {*split.inner}
+        return {n: v for n, v in here.values.items() if n not in out}
 
     def taken(self, values: Mapping[str, np.ndarray], index: np.ndarray) -> dict[str, np.ndarray]:
         """Values of some draws; what all agree on stays as it is."""
@@ -190,7 +211,7 @@ class _Paths:
         which: np.ndarray,
         rows: np.ndarray,
         values: Mapping[str, np.ndarray],
-        message: Message,
+        message: _Later,
     ) -> np.ndarray:
         """Log density of what paths have after the k-th slice, given particles of that one.
 
@@ -208,7 +229,7 @@ class _Paths:
         steps, reads = self._between(k + 1, before)
         log: Any = 0.0
         if steps:
-            known = dict(self.step.sampling.known(self.series.row(self.first + k + 1)))
+            known = dict(self.step.sampling.known(self.series.row(k + 1)))
             known |= {n: v[rows, None] if self._own(n, v) else v for n, v in values.items()}
             known |= {
                 n + PREVIOUS: v[which] if self._own(n, v) else v
@@ -221,46 +242,55 @@ class _Paths:
             log = np.asarray(state.log_weight, dtype=float)
         pairs, flat = np.repeat(rows, which.shape[1]), which.reshape(-1)
         if reads:  # what is said depends on the particle it is said to
-            now = self.taken(values, pairs)
+            now, of = self.taken(values, pairs), np.arange(len(pairs))
             said, own = self.pulled(k, self.taken(before, flat), now, message.taken(pairs))
-            found = own + log_evidence(said, np.arange(len(pairs)), here.inner, flat)
+            found = own + log_evidence(said.numbers, of, here.inner, flat)
         else:
             of = np.repeat(np.arange(len(rows)), which.shape[1])
             now = self.taken(values, rows)
             said, _ = self.pulled(k, before, now, message.taken(rows))
-            found = log_evidence(said, of, here.inner, flat)
-        found = found.sum(axis=tuple(range(1, found.ndim))).reshape(which.shape)
-        return np.broadcast_to(found + log, which.shape)
+            found = log_evidence(said.numbers, of, here.inner, flat)
+        found = found.sum(axis=tuple(range(1, found.ndim)))
+        if here.tables is not None:
+            found = found + log_evidence_of(said.states, of, here.tables, flat)
+        return np.broadcast_to(found.reshape(which.shape) + log, which.shape)
 
     def pulled(
         self,
         k: int,
         before: Mapping[str, np.ndarray],
         values: Mapping[str, np.ndarray],
-        message: Message,
-    ) -> tuple[Message, np.ndarray]:
+        message: _Later,
+    ) -> tuple[_Later, np.ndarray]:
         """What is said to the k-th slice, given what is said to the next and values of both."""
-        place, row = self._place(k + 1), self.series.row(self.first + k + 1)
-        known = self._values(place, row, before, values, len(message.target))
+        place, row = self._place(k + 1), self.series.row(k + 1)
+        count = len(message.numbers.target)
+        known = self._values(place, row, before, values, count)
         pattern, target, _ = seen_of(place.layout, row)
         found = place.reader.read(known)
-        return pulled(
-            message, place.layout, pattern, found, target, sizes_of(self.filtered[k].inner)
+        numbers, own = pulled(
+            message.numbers, place.layout, pattern, found, target, sizes_of(self.filtered[k].inner)
         )
+        if self.step.tables is None:
+            return _Later(numbers, ()), own
+        told = told_by(self.step.tables, row, self._known(row, before, values, count))
+        return _Later(numbers, pulled_tables(told, message.states)), own
 
     def believed(
         self,
         drawn: Sequence[Mapping[str, np.ndarray]],
-        messages: Sequence[Message],
+        messages: Sequence[_Later],
         rng: np.random.Generator,
     ) -> list[Particles]:
         """Smoothed beliefs given each path, and one draw of them for all slices."""
-        count, found = len(messages[0].target), []
+        count, found = len(messages[0].numbers.target), []
         layout = Layout(count, (), ())
         filtered: Gaussians | None = None
         joint: Gaussians | None = None
+        tables: Along | None = None
+        past: dict[str, np.ndarray] = {}
         for k, values in enumerate(drawn):
-            row, place = self.series.row(self.first + k), self._place(k)
+            row, place = self.series.row(k), self._place(k)
             own = self._values(place, row, drawn[k - 1] if k else {}, values, count)
             pattern, target, given = seen_of(place.layout, row)
             coefficients = place.reader.read(own)
@@ -277,16 +307,57 @@ class _Paths:
                 for before in (filtered, joint)
             )
             smoothed, sample = (
-                combined(messages[k], filtered),
-                combined(messages[k], alone).drawn(rng),
+                combined(messages[k].numbers, filtered),
+                combined(messages[k].numbers, alone).drawn(rng),
             )
             joint = _point(smoothed, sample)
-            whole = {**values, **smoothed.values_of(sample)}
+            whole, states = {**values, **smoothed.values_of(sample)}, None
+            if self.step.tables is not None:
+                tables, more = self._finite(k, (past, whole), messages[k].states, tables, rng)
+                whole, states = {**whole, **more}, tables.smoothed
+            past = {n + PREVIOUS: v for n, v in whole.items()}
             made = evenly_weighted(self.filtered[k].t, whole, layout)
-            found.append(made._replace(inner=smoothed))
+            found.append(made._replace(inner=smoothed, tables=states))
         return found
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _finite(
+        self,
+        k: int,
+        values: tuple[Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
+        message: tuple[np.ndarray, ...],
+        before: Along | None,
+        rng: np.random.Generator,
+    ) -> tuple[Along, dict[str, np.ndarray]]:
+        """Tables of a slice, and a draw of what has them and of what waits for it, given values of two."""
+        step, row = self.step, self.series.row(k)
+        past, now = values
+        count = len(message[0])
+        stems = {n.removesuffix(PREVIOUS): v for n, v in past.items()}
+        known = self._known(row, stems, now, count)
+        found = along(told_by(step.tables, row, known), message, before, step.tables, rng)
+        nodes = [step.slices.first[n] for n in step.tables.plan.names]
+        drawn = found.smoothed.values(found.codes, nodes)
+        late = step.tables.left_out(not k) - step.tables.plan.names
+        drawn |= {n: row.seen[n].value for n in late if n in row.seen and row.seen[n].mask is None}
+        every = {**known.values, **past, **now, **drawn}
+        return found, drawn | drawn_afterwards(step.slices, row, late, every, count, rng)
+
+    def _known(
+        self,
+        row: Any,
+        before: Mapping[str, np.ndarray],
+        values: Mapping[str, np.ndarray],
+        count: int,
+    ) -> Known:
+        """Values that tables may read, of a slice and the one before."""
+        found = dict(self.step.sampling.known(row))
+        found |= {n + PREVIOUS: v for n, v in before.items() if n in self.step.slices.interface}
+        found |= values
+        ranks = self.step.ranks
+        own = {n for n, v in found.items() if v.ndim == ranks.get(n.removesuffix(PREVIOUS), -1)}
+        return Known(found, frozenset(own), count)
 
     def _own(self, name: str, value: np.ndarray) -> bool:
         """Whether particles have values of their own of a node."""
@@ -294,7 +365,7 @@ class _Paths:
 
     def _place(self, k: int) -> Any:
         inner = self.filtered[k - 1].inner if k else None
-        return self.step.place(self.series.row(self.first + k), inner)
+        return self.step.place(self.series.row(k), inner)
 
     def _values(
         self,
@@ -321,6 +392,9 @@ class _Paths:
         if key not in self._crossing:
             layout, reached = place.layout, {n + PREVIOUS for n in entering}
             reads = bool(place.reader.leaves & reached)
+            if self.step.tables is not None:
+                row = self.series.row(k)
+                reads |= any(s.reads_before(row, entering) for s in self.step.tables.steps)
             steps: list[Step] = []
             for name in layout.order:
                 node = layout.model[name]

@@ -75,7 +75,7 @@ def split_of(
     seen: frozenset[str],
     asked: str | tuple[str, ...],
     static: Mapping[str, np.ndarray],
-    tabled: bool = True,
+    untabled: str | None = None,
 ) -> Split:
     """The split that is asked for: ``"auto"``, which integrates out what it can, or nodes by name.
 
@@ -85,8 +85,8 @@ def split_of(
         Nodes that are seen in full in every slice.
     static : dict
         Values of the static nodes.
-    tabled : bool
-        Whether finite nodes may be integrated out.
+    untabled : str or None
+        Why finite nodes may not be integrated out.
 
     Raises
     ------
@@ -94,9 +94,9 @@ def split_of(
         A node that is named cannot be integrated out.
     """
     kept = slices.later.cache.setdefault("splits", {})
-    key = (seen, asked, tabled, tuple((n, np.asarray(v).tobytes()) for n, v in static.items()))
+    key = (seen, asked, untabled, tuple((n, np.asarray(v).tobytes()) for n, v in static.items()))
     if key not in kept:
-        kept[key] = _found(slices, seen, asked, static, tabled)
+        kept[key] = _found(slices, seen, asked, static, untabled)
     return kept[key]
 
 
@@ -141,13 +141,13 @@ def _found(
     seen: frozenset[str],
     asked: str | tuple[str, ...],
     static: Mapping[str, np.ndarray],
-    tabled: bool,
+    untabled: str | None,
 ) -> Split:
     """Numbers first, then finite nodes that these leave."""
     search = _Search(slices, seen, static)
     if asked == AUTO:
         numbers = search.found()
-        if not tabled:
+        if untabled is not None:
             return numbers
         # what is measured and missing, of nothing that is integrated out, can as well wait for tables
         loose = search.loose(numbers.inner)
@@ -159,10 +159,10 @@ def _found(
         return replace(numbers, inner=inner, why={**numbers.why, **why}, tables=tables)
     finite = [n for n in asked if n in search.hidden and is_finite(slices, n)]
     others = tuple(n for n in asked if n not in finite)
-    if finite and not tabled:
+    if finite and untabled is not None:
         raise UnsupportedError(
-            f"marginalize= names {finite[0]!r}, and tables of finite nodes tell nothing of slices before "
-            f"(smooth, lag=, delay=); leave {', '.join(map(repr, finite))} out"
+            f"marginalize= names {finite[0]!r}, of which tables tell nothing of slices before here: "
+            f"{untabled}; leave {', '.join(map(repr, finite))} out"
         )
     numbers = search.named(others, finite)
     apart_from = {*numbers.inner, *numbers.below}

@@ -258,8 +258,11 @@ def alike(one: Particles, other: Particles) -> bool:
     """Whether two slices can stand side by side: laid out alike, and none drawn anew."""
     if len(one.weights) != len(other.weights) or one.rejuvenated is not False:
         return False
-    for name, own in one.values.items():
-        if own.ndim != other.values[name].ndim:
+    # without what is drawn once it is looked at
+    if dict.keys(one.values) != dict.keys(other.values):
+        return False
+    for name, own in dict.items(one.values):
+        if own.ndim != dict.__getitem__(other.values, name).ndim:
             return False
     return other.rejuvenated is False
 

@@ -13,7 +13,8 @@ from bayesmc.engines.filtering import Queries
 from bayesmc.engines.particles.backward import lagged
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
-from bayesmc.engines.particles.record import FilteredParticles, Record, filtered_by
+from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.smc import Bare, Particles
 from bayesmc.randomness import Purpose, stream
 
@@ -98,6 +99,11 @@ def looked_back(
     found = lagged(window, step.layout, step.slices)
     if found.inner is None or len(window) == 1:
         return found
-    inner = found.inner.back(len(window) - 1)
-    drawn = inner.completed(stream(seed, Purpose.SMOOTH, found.t))
-    return found._replace(values=found.values | drawn, inner=inner)
+    inner, tables = found.inner.back(len(window) - 1), found.tables
+    rng = stream(seed, Purpose.SMOOTH, found.t)
+    drawn = inner.completed(rng)
+    if tables is not None:
+        tables = tables.back(len(window) - 1)
+        nodes = [step.slices.first[n] for g in tables.groups for n in g.names]
+        drawn |= tables.values(tables.drawn(rng), nodes)
+    return found._replace(values=found.values | drawn, inner=inner, tables=tables)

@@ -69,7 +69,7 @@ class Tracker:
         self.layout = step.layout
         read = map(step.slices.later.__getitem__, step.slices.interface)
         nodes = [n for n in read if not n.is_object]
-        self.sight = Sight(nodes, step.layout)
+        self.sight = Sight([n for n in nodes if n.name not in step.too_wide], step.layout)
         finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
         self.scouting = step.scouting() if finite else None
         blind = step.is_guided or step.first_stage is not None or step.injection is not None

@@ -47,9 +47,10 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     ----------
     sweeps : int
         Passes back and forth, at most.
-    damping : float
-        Share of the old message that is kept, 0 or more and less than 1: slower, and steadier. On nets it
-        grows by itself where messages do not come closer; tables of finite nodes alone are not damped before.
+    damping : float, optional
+        Share of the old message that is kept, 0 or more and less than 1: slower, and steadier. By default it
+        is .2, and grows by itself where messages do not come closer; on nets that is so of a number, too, and
+        tables of finite nodes alone are not damped before.
     tolerance : float
         Change of a sweep with which messages have settled; see ``PropagatedPosterior.change``.
     families : dict, optional
@@ -71,7 +72,8 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
 
     Over time a slice and the one before, with both messages that come from outside, are a mixture over pairs
     of modes; it is collapsed to the belief of the same means and covariances in each mode, and what came from
-    outside is divided out again. The first pass forward is assumed-density filtering, the same as
+    outside is divided out again. A message with which a neighbouring slice would have no integral is taken
+    back part of the way, and counted. The first pass forward is assumed-density filtering, the same as
     ``SwitchingKalmanFilter("gpb2")``; ``filter`` and ``forecast`` answer what it says. ``smooth`` takes all
     rows; of fixed lags ask ``SwitchingKalmanFilter``. Numbers of a slice that later rows tell without noise
     would make messages infinite, and are refused as they are met.
@@ -135,7 +137,7 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     def passed(self, system: System, progress: bool | None) -> Settled:
         with Progress(int(self.sweeps), self.label, progress) as bar:
             return settle(
-                system, sweeps=int(self.sweeps), damping=float(self.damping),
+                system, sweeps=int(self.sweeps), damping=_DAMPING if self.damping is None else self.damping,
                 tolerance=float(self.tolerance), advance=partial(bar.advance, 1),
             )  # fmt: skip
 
@@ -213,6 +215,9 @@ class AssumedDensity(MessageEngine):
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+#: that messages on nets begin with
+_DAMPING = 0.2
 
 
 def _unsaid(end: Settled) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from dataclasses import dataclass
 from functools import partial
@@ -38,7 +39,9 @@ class PropagatedSeries(SwitchingSeries):
         Kullback-Leibler divergence, in standard deviations where modes are certain.
     sweeps : int
     skipped : int or ndarray
-        Improper messages that were left out, in all sweeps.
+        Improper messages that were left out, or taken back in part, in all sweeps.
+    damping : float or ndarray
+        In the last sweep.
     log_marginal_likelihood : float or ndarray
         Approximate; NaN where some slice with its messages has no finite integral.
         ``log_marginal_increments`` are the slices' parts of it; the log density of a row given those before
@@ -49,6 +52,7 @@ class PropagatedSeries(SwitchingSeries):
     change: Any
     sweeps: int
     skipped: Any
+    damping: Any
 
     @classmethod
     def of(cls, answers: SwitchingSeries, end: Propagated) -> PropagatedSeries:
@@ -56,8 +60,9 @@ class PropagatedSeries(SwitchingSeries):
         found = object.__new__(cls)
         found.__dict__.update(answers.__dict__)
         found.sweeps = end.sweeps
-        found.converged, found.change, found.skipped = (
-            a if np.ndim(a) else a.item() for a in (end.converged, end.change, end.skipped)
+        found.converged, found.change, found.skipped, found.damping = (
+            a if np.ndim(a) else a.item()
+            for a in (end.converged, end.change, end.skipped, end.damping)
         )
         return found
 
@@ -73,8 +78,8 @@ class SeriesPropagation(SwitchingEngine):
     Change point problems in linear dynamical systems, JMLR 6.
     """
 
-    sweeps: int = 100
-    damping: float = 0.2
+    sweeps: int = 200
+    damping: float | None = None
     tolerance: float = 1e-5
     linearize: bool = False
     max_modes: int = 64
@@ -88,6 +93,15 @@ class SeriesPropagation(SwitchingEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         return _NO_LAGS if asked.what == "fixed-lag" else super().unable(problem, asked)
 
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        named = getattr(self, "families", None)
+        if named:
+            return (
+                f"ExpectationPropagation(families={dict(named)!r}): over time all numbers are normal given "
+                "the modes, and no node has another family; leave families= out"
+            )
+        return super().refusal(problem)
+
     def effort(self, problem: SeriesProblem) -> str:
         run = self._run(problem)
         return (
@@ -95,6 +109,13 @@ class SeriesPropagation(SwitchingEngine):
             f"most {self.sweeps} passes back and forth; the log marginal likelihood is an approximation of "
             "unknown error"
         )
+
+    def sweep_cost(self, problem: SeriesProblem) -> float:
+        """Of a pass back and forth, in slices of few modes and numbers (some half a millisecond each)."""
+        run = self._run(problem)
+        layout, pairs = run.data.layouts[-1], len(run.stretches[-1].pairs.dst)
+        work = pairs * math.prod(layout.lead) * (2.0 * layout.carried) ** 3
+        return problem.steps * (1.0 + work / _WORK)
 
     def smooth(
         self,
@@ -107,6 +128,15 @@ class SeriesPropagation(SwitchingEngine):
     ) -> SwitchingSeries:
         if lag is not None:
             raise UnsupportedError(_NO_LAGS)
+        answers, doubt = self.smoothed(problem, queries, progress)
+        if doubt is not None:
+            warnings.warn(doubt, ConvergenceWarning, stacklevel=3)
+        return answers
+
+    def smoothed(
+        self, problem: SeriesProblem, queries: Queries | None, progress: bool | None
+    ) -> tuple[PropagatedSeries, str | None]:
+        """Beliefs where messages ended, and why these are no answer, or None."""
         run = self._run(problem)
         with quiet():
             with Progress(problem.steps, self.label, progress) as bar:
@@ -117,9 +147,7 @@ class SeriesPropagation(SwitchingEngine):
             found = messages.answers(end)
             increments = messages.increments(end, increments)
         answers = PropagatedSeries.of(run.answers("smooth", found, increments, queries), end)
-        if not end.converged.all():
-            warnings.warn(_doubt(self, end), ConvergenceWarning, stacklevel=3)
-        return answers
+        return answers, _doubt(self, end)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -130,6 +158,10 @@ class SeriesPropagation(SwitchingEngine):
 
 # ---- private ------------------------------------------------------------------------------------
 
+#: damping up to which nothing is made of improper messages that were met on the way
+_CALM = 0.45
+#: multiplications of a slice that cost as much as all else that is done for it
+_WORK = 20_000.0
 _NO_LAGS = (
     "ExpectationPropagation smooths given all rows, and lag= would pass messages anew for every slice; use "
     "SwitchingKalmanFilter"
@@ -169,7 +201,7 @@ class _Messages:
         forth = [Visit(k, (1,)) for k in range(count)]
         return propagate(
             priors, self.factors, sites, back + forth, sweeps=int(engine.sweeps),
-            damping=float(engine.damping), tolerance=float(engine.tolerance), advance=advance,
+            damping=engine.damping, tolerance=float(engine.tolerance), advance=advance,
         )  # fmt: skip
 
     def answers(self, end: Propagated) -> list[Mixture]:
@@ -195,9 +227,12 @@ def check_options(engine: Any) -> None:
     name, sweeps = type(engine).__name__, engine.sweeps
     if isinstance(sweeps, bool) or not isinstance(sweeps, (int, np.integer)) or sweeps < 1:
         raise ValueError(f"{name}(sweeps={sweeps!r}): give a number, 1 or more")
-    if not _is_number(engine.damping) or not 0.0 <= engine.damping < 1.0:
+    if engine.damping is not None and not (
+        _is_number(engine.damping) and 0.0 <= engine.damping < 1.0
+    ):
         raise ValueError(
-            f"{name}(damping={engine.damping!r}): give a share of the old message, 0 or more and less than 1"
+            f"{name}(damping={engine.damping!r}): give a share of the old message, 0 or more and less than "
+            "1, or None"
         )
     if not _is_number(engine.tolerance) or not 0.0 < engine.tolerance < np.inf:
         raise ValueError(f"{name}(tolerance={engine.tolerance!r}): give a number above 0")
@@ -212,17 +247,32 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, (int, float, np.integer, np.floating))
 
 
-def _doubt(engine: SeriesPropagation, end: Propagated) -> str:
-    """By how much messages have not settled."""
+def _doubt(engine: SeriesPropagation, end: Propagated) -> str | None:
+    """By how much messages have not settled, or what there was on the way to where they did; or None."""
+    if end.converged.all():
+        rough = (end.skipped > 0) & (end.damping > _CALM)
+        if not rough.any():
+            return None
+        return (
+            f"ExpectationPropagation: messages have settled, but {int(end.skipped.max())} of them were taken "
+            f"back on the way, as they were improper, and it took damping of {float(end.damping.max()):.2g}: "
+            "such answers, and the log evidence above all, are at times far off; hold them against "
+            "ParticleFilter"
+        )
     whose = ""
     if end.converged.ndim:
         whose = f" for {int((~end.converged).sum())} of {end.converged.size} elements"
     change, left = float(end.change.max()), int(end.open.max(initial=0))
     out = (
-        f" and left out {left} improper messages ({int(end.skipped.max())} in all)" if left else ""
+        f" and left out or took back {left} improper messages ({int(end.skipped.max())} in all)"
+        if left
+        else ""
+    )
+    steadier = (
+        "" if engine.damping is None else f"more damping than {float(engine.damping):.2g} or "
     )
     return (
         f"ExpectationPropagation: messages have not settled{whose} after {end.sweeps} sweeps: the last one "
-        f"changed a belief by {change:.2g} (tolerance {float(engine.tolerance):.2g}){out}. Give more damping "
-        f"than {float(engine.damping):.2g} or more sweeps, or take SwitchingKalmanFilter or ParticleFilter"
+        f"changed a belief by {change:.2g} (tolerance {float(engine.tolerance):.2g}){out}. Give {steadier}"
+        "more sweeps, or take SwitchingKalmanFilter or ParticleFilter"
     )

@@ -38,6 +38,21 @@ class Moved(NamedTuple):
     pair: np.ndarray | None
 
 
+class Told(NamedTuple):
+    """What a slice and its row say of tables.
+
+    Attributes
+    ----------
+    pair : ndarray or None, shape (particles or 1, elements or 1, states, states)
+        As ``Moved.pair``.
+    log : ndarray, shape (particles, elements, states)
+        Logs of what is said of the states of the slice; in slice 0 with their probabilities.
+    """
+
+    pair: np.ndarray | None
+    log: np.ndarray
+
+
 class Pick(NamedTuple):
     """What a row says of one element for each particle.
 
@@ -87,24 +102,15 @@ class GroupStep:
         ------
         ParameterError
         """
-        group, n = self.group, rows.particles
-        now, earlier = group.scope(0), group.scope(1)
         pieces = self._pieces(rows)
-        sizes = {v: k for lag in (0, 1) for v, k in zip(group.scope(lag), group.sizes, strict=True)}
-        both = [p for p in pieces if any(v[0] for v in p.scope)]
-        here = [p for p in pieces if p not in both]
-        shape = (n, group.elements, group.states)
-        log = log_product(here or [NEUTRAL], now, sizes)
-        log = log.reshape(*log.shape[:2], group.states)
-        pair = None
+        pair, log, is_told = self._factors(pieces, before is None)
         if before is not None:
-            pair = log_product(both or [NEUTRAL], (*earlier, *now), sizes)
-            pair = pair.reshape(*pair.shape[:2], group.states, group.states)
-            if not here and _stays(pair):
+            assert pair is not None
+            if not is_told and _stays(pair):
                 return Moved(before, np.zeros(before.shape[:2]), pair)
             moved = propagated(before, pair) + log
         else:
-            moved = np.broadcast_to(log, shape)
+            moved = np.broadcast_to(log, (rows.particles, self.group.elements, self.group.states))
         total = log_sum_exp(moved, axis=-1)
         if before is not None and pair is not None and not (total > -np.inf).all():
             exact = log_sum_exp(before[..., :, None] + pair, axis=-2) + log
@@ -114,6 +120,18 @@ class GroupStep:
         log = moved - np.where(total > -np.inf, total, 0.0)[..., None]
         self._refuse_invalid(pieces, before, pair, log)
         return Moved(log, total, pair)
+
+    def told(self, rows: ParticleRows) -> Told:
+        """What moves the tables, and all that is said of them, of single elements, too."""
+        pair, log, _ = self._factors(self._pieces(rows), not rows.row.t)
+        log = np.array(
+            np.broadcast_to(log, (rows.particles, self.group.elements, self.group.states))
+        )
+        every = np.arange(rows.particles)
+        for pick in self.picks(rows):
+            own = pick.log if pick.bad is None else np.where(pick.bad, -np.inf, pick.log)
+            log[every, pick.at] += own
+        return Told(pair, log)
 
     def is_moved_by(self, row: Row, names: Collection[str]) -> bool:
         """Whether transitions, or what is said of whole tables, depend on nodes of the slice."""
@@ -150,7 +168,32 @@ class GroupStep:
                 found.append(Pick(name, numbers[:, k], log[..., k], own))
         return found
 
+    def reads_before(self, row: Row, names: Collection[str]) -> bool:
+        """Whether transitions, or what is said, depend on some nodes of the slice before."""
+        return any(
+            lag and stem in names
+            for name, look in self.looks[min(row.t, 2)].items()
+            if name in self.group.names or name in row.seen
+            for lag, stem in look.term.reads
+        )
+
     # ---- private -------------------------------------------------------------------------------
+
+    def _factors(
+        self, pieces: Sequence[Piece], is_first: bool
+    ) -> tuple[np.ndarray | None, np.ndarray, bool]:
+        """Logs over two slices and over this one, and whether anything is said of this one alone."""
+        group = self.group
+        now, earlier = group.scope(0), group.scope(1)
+        sizes = {v: k for lag in (0, 1) for v, k in zip(group.scope(lag), group.sizes, strict=True)}
+        both = [p for p in pieces if any(v[0] for v in p.scope)]
+        here = [p for p in pieces if p not in both]
+        log = log_product(here or [NEUTRAL], now, sizes)
+        log = log.reshape(*log.shape[:2], group.states)
+        if is_first:
+            return None, log, bool(here)
+        pair = log_product(both or [NEUTRAL], (*earlier, *now), sizes)
+        return pair.reshape(*pair.shape[:2], group.states, group.states), log, bool(here)
 
     def _pieces(self, rows: ParticleRows) -> list[Piece]:
         """Factors over whole tables; what is the same in all slices is kept."""

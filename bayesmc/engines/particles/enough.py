@@ -1,0 +1,190 @@
+"""How many particles are enough, at which price, and what is said where they were not."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.errors import LowEssWarning
+
+#: particles of a filter that is not told how many, at least, and at most
+START, MOST = 1000, 100_000
+#: those of the first short run; each next one has four times as many
+FIRST, TIMES = 250, 4
+#: error of the log evidence that is aimed at
+TOLERANCE = 0.5
+#: particles times slices that a run may take, and those whose particles are kept
+BUDGET, KEPT = 30_000_000, 5_000_000
+#: what a particle that looks at the row costs, in particles that do not: 4 where what is seen is affine in
+#: what is hidden, 19 for Poisson counts; measured once, so that the same call gives the same answer anywhere
+GUIDED = 20
+#: numbers that a particle carries that cost as much as a draw
+CARRIED = 2.0
+#: error of a short run up to which it says how many particles are enough; beyond it is no longer normal
+TRUSTED = 1.5
+#: variance that is aimed at, as a share of the tolerance's
+AIM = 0.6
+#: error of the log evidence above which a warning says so
+LARGE = 1.0
+#: the same where the number of particles is given
+LARGE_GIVEN = 3.0
+#: slices that rest on a single particle which are no accident any more, and their share of all
+SEVERAL, OFTEN = 3, 0.005
+#: equally weighted particles below which a slice rests on a single one
+COLLAPSED = 2.0
+#: and those below which a slice is named as one that is hard to explain
+FEW = 30.0
+#: share of such slices from which on a warning says so
+MANY = 0.1
+
+
+def enough(
+    tried: Callable[[int, int], float], tolerance: float, slices: int, budget: int, keep: bool
+) -> int:
+    """Particles with which the error of the log evidence is likely to be as small as is asked.
+
+    Parameters
+    ----------
+    tried : callable
+        ``(particles, unit) -> error`` of a run with a random stream of its own.
+    tolerance : float
+    slices : int
+        Times the elements of plates that are filtered separately, and the price of a particle.
+    budget : int
+        Particles times slices.
+    keep : bool
+        Whether particles of all slices are held, which takes memory.
+
+    Returns
+    -------
+    int
+        A power of two times ``START``, or the most that the budget allows; ``START`` at least. The answer is
+        that of a run of its own, so what chose the number has no part in it, and the evidence is unbiased.
+    """
+    most = affordable(slices, budget, keep)
+    particles, unit = FIRST, 1
+    while particles < most:
+        error = tried(particles, unit)
+        if error <= TRUSTED:
+            wanted = particles * (error / tolerance) ** 2 / AIM
+            doublings = math.ceil(math.log2(max(wanted / START, 1.0)))
+            return min(START * 2**doublings, most)
+        particles, unit = particles * TIMES, unit + 1
+    return most
+
+
+def price(engine: Any, carried: float = 0.0) -> int:
+    """What a particle of a slice costs, in draws from its own density.
+
+    ``carried`` are numbers that it carries of what is integrated out.
+    """
+    guided = isinstance(engine.proposal, str) or engine.auxiliary is True
+    return (GUIDED if guided else 1) * (1 + math.ceil(carried / CARRIED))
+
+
+def affordable(slices: int, budget: int, keep: bool) -> int:
+    """The most particles that are tried where nobody says how many."""
+    share = min(budget, KEPT) if keep else budget
+    return max(START, min(MOST, share // max(slices, 1)))
+
+
+def collapsed(filtered: FilteredParticles) -> str | None:
+    """What is said where many slices rest on what is little more than one particle.
+
+    A surprising row now and then does that to any filter, and the next rows mend it.
+    """
+    assert filtered.weight_ess is not None and filtered.counts is not None
+    ess = filtered.weight_ess.reshape(filtered.steps, -1)
+    most = int(filtered.counts.max())
+    poor = ess < min(COLLAPSED, 0.9 * most)
+    share = poor.mean(axis=0)
+    worst = int(share.argmax())
+    if share[worst] <= MANY:
+        return None
+    own = ess[:, worst]
+    at = int(own.argmin())
+    return (
+        f"in {int(poor[:, worst].sum())} of {len(own)} slices the {most} particles are worth less than "
+        f"{COLLAPSED:g} equally weighted ones (weight_ess; {own[at]:.1f} in slice {filtered.start + at}), so "
+        "means, spreads and the evidence rest on one of them: use more particles, a proposal= that looks at "
+        "the observations, or less narrow noise"
+    )
+
+
+def uncertain(filtered: FilteredParticles, engine: Any, carried: float = 0.0) -> str | None:
+    """What is said where the log evidence is not known well.
+
+    Who gives a number of particles may ask for states alone, which few may follow well: then it takes a
+    larger error; or a first row that next to no particle explains, since what is missing there is never found
+    again, or several rows of that kind.
+    """
+    assert filtered.counts is not None and filtered.weight_ess is not None
+    given = engine.particles is not None
+    errors = np.atleast_1d(np.asarray(filtered.log_marginal_likelihood_mcse, dtype=float))
+    worst = float(errors.max())
+    if not worst > (LARGE_GIVEN if given else LARGE):
+        return None
+    ess = filtered.weight_ess.reshape(filtered.steps, -1)[:, int(errors.reshape(-1).argmax())]
+    at = int(ess.argmin())
+    if math.isinf(worst):
+        weighed = np.flatnonzero(ess < 0.999 * filtered.counts)
+        if given:
+            at = int(weighed[0]) if len(weighed) else at
+            single = np.count_nonzero(ess < COLLAPSED)
+            if ess[at] >= COLLAPSED and single < max(SEVERAL, OFTEN * len(ess)):
+                return None
+            at = at if ess[at] < COLLAPSED else int(ess.argmin())
+        said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
+    else:
+        said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
+    why = (
+        f"weight_ess is {ess[at]:.1f} in slice {filtered.start + at}"
+        if ess[at] < FEW
+        else "particles that later rows ask for were rare among those of earlier slices"
+    )
+    return (
+        f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
+        f"be off as well ({why}); use {_more(filtered, engine, carried)}, a "
+        "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
+    )
+
+
+def warn_of_errors(filtered: FilteredParticles, engine: Any, carried: float = 0.0) -> None:
+    """At most one warning: that slices rest on one particle, or that the evidence is not known well.
+
+    ``carried`` is what ``price`` takes.
+    """
+    text = collapsed(filtered) or uncertain(filtered, engine, carried)
+    if text is not None:
+        warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _more(filtered: FilteredParticles, engine: Any, carried: float) -> str:
+    """How to have more particles, by what set their number."""
+    assert filtered.counts is not None
+    if engine.particles is not None or engine.adapt is not None:
+        return "more particles"
+    count, keep = int(filtered.counts.max()), filtered.held is not None
+    if count >= MOST:
+        return (
+            f"more particles than the {MOST:_} that are tried at most, such as "
+            f"ParticleFilter({4 * MOST:_})"
+        )
+    assert filtered.log_marginal_increments is not None
+    slices = math.prod(filtered.log_marginal_increments.shape) * price(engine, carried)
+    if count < affordable(slices, engine.budget, keep):
+        return (
+            f"a number of your own, such as ParticleFilter({4 * count:_}) (short runs found {count:_} "
+            "enough)"
+        )
+    if keep and engine.budget > KEPT:
+        return "more particles, whose number is held down where all slices are kept (smooth, keep=)"
+    return f"a larger budget= than {engine.budget:_}"
