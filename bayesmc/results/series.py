@@ -17,9 +17,10 @@ from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_y
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.laws import Laws, NormalLaws, TableLaws, curve_between
 from bayesmc.results.marginal_answers import MarginalAnswers
-from bayesmc.results.posterior import quantile_levels, table_variance
+from bayesmc.results.posterior import quantile_levels
 from bayesmc.results.saving import save
 from bayesmc.results.series_checks import SeriesChecks
+from bayesmc.results.statistics import table_variance
 
 #: what is asked of answers over time that has another name here, or that only some filters have
 _INSTEAD = {

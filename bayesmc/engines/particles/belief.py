@@ -27,7 +27,7 @@ from bayesmc.network import CompiledNode
 from bayesmc.randomness import Purpose, resumed, stream
 from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal_answers import MarginalAnswers
-from bayesmc.results.posterior import table_variance
+from bayesmc.results.statistics import table_variance
 
 
 class ParticleBelief(OnlineBelief):
