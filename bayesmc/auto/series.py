@@ -170,7 +170,7 @@ def smooth(
             f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
         )
     if engine is None and isinstance(chosen, ExpectationPropagation):
-        return settled_or_kim(chosen, problem, seed_sequence(rng), queries, progress)
+        return settled_or_kim(chosen, problem, queries, progress)
     options |= {"lag": lag, "queries": queries, "progress": progress}
     return chosen.smooth(problem, seed_sequence(rng), **options)
 

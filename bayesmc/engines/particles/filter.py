@@ -34,6 +34,7 @@ from bayesmc.engines.particles.options import (
     check_count,
     check_kind,
     check_numbers,
+    check_parts,
     check_together,
     described,
     looks_told,
@@ -378,6 +379,7 @@ class ParticleFilter(FilterEngine):
         return bound(self._sized(START), belief, dbn, slices)
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
+        check_parts(self, row.seen)
         if self.marginalize is None and not isinstance(belief.made_by, FilterStep):
             warn_of_what_is_not_guided(self, slices, row.seen)
         found = absorbed(self._sized(START), belief, slices, row)

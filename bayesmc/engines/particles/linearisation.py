@@ -30,6 +30,7 @@ from bayesmc.engines.particles.looking import (
     NUMBERS,
     by_moments,
     density_at,
+    elements_seen,
     has_moments,
     moments,
     numbers_of,
@@ -75,7 +76,7 @@ class LookAhead:
     block : sequence of str
         Normal and MvNormal nodes, parents first.
     seen : dict
-        Node that depends on the block -> mask of the elements seen, shape ``plates``; None for all.
+        Node that depends on the block -> what is seen of it (``mask_of``).
     order : sequence of str
         Nodes of the slice, parents first.
     apart : tuple of str
@@ -104,12 +105,10 @@ class LookAhead:
         self.sizes = [numbers_of(model, n, apart) for n in self.block]
         self.total = sum(self.sizes)
         self.between = {n: _between(model, order, block, n) for n in (*self.block, *self.seen)}
+        masks = {n: _over_events(m, model[n]) for n, m in self.seen.items() if m is not None}
         self.masks = {
-            n: self._flat(
-                model[n], np.broadcast_to(_over_events(m, model[n]), model[n].value_shape)
-            )
-            for n, m in self.seen.items()
-            if m is not None
+            n: self._flat(model[n], np.broadcast_to(m, model[n].value_shape))
+            for n, m in masks.items()
         }
         self.straight = [
             n
@@ -208,7 +207,7 @@ class LookAhead:
             weights = np.broadcast_to(dist.weights, (*dist.batch_shape, dist.weights.shape[-1]))
             with np.errstate(divide="ignore"):
                 log = np.log(weights[..., choice])
-            mask = self.seen.get(name)
+            mask = elements_seen(self.seen.get(name), node, np.any)
             if mask is not None:
                 log = np.where(mask, log, 0.0)
             total = total + summed(
@@ -237,8 +236,9 @@ class LookAhead:
             batch = (len(points), *state.batch)
             for name in self.curved:
                 values = self._computed(state, name, full)
-                log = density_at(self.model, name, values, self.seen[name])
                 node = self.model[name]
+                mask = elements_seen(self.seen[name], node)
+                log = density_at(self.model, name, values, mask)
                 log = np.broadcast_to(log, batch + node.plate_shape)
                 total = total + summed(log, node, self.apart)
             return total
@@ -432,7 +432,7 @@ def _settled(cov: np.ndarray) -> np.ndarray:
 
 
 def _over_events(mask: np.ndarray, node: CompiledNode) -> np.ndarray:
-    return mask.reshape(mask.shape + (1,) * len(node.event_shape))
+    return mask.reshape(mask.shape + (1,) * (len(node.value_shape) - mask.ndim))
 
 
 def _root(cov: np.ndarray) -> np.ndarray:

@@ -32,8 +32,8 @@ from bayesmc.errors import QueryError
 from bayesmc.network import Model
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
+from bayesmc.results.series import SeriesPosterior, without_labels
 
 #: slices that are written together, at most, and those that are though half as many would stay in cache
 TOGETHER, FEW = 100, 6
@@ -361,8 +361,8 @@ class FilteredParticles(SeriesPosterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
-        held = self._kept("quantile")
-        return held.quantile(self._node(name).name, q)
+        node = without_labels(self._node(name), "quantile")
+        return self._kept("quantile").quantile(node.name, q)
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""

@@ -129,12 +129,26 @@ class SwitchingKalmanFilter(SwitchingEngine):
         queries: Queries | None = None,
         progress: bool | None = None,
     ) -> SwitchingSeries:
+        others = "ExpectationPropagation() or ParticleFilter(particles)"
+        return self.smoothed(problem, others, lag=lag, queries=queries, progress=progress)
+
+    def smoothed(
+        self,
+        problem: SeriesProblem,
+        others: str,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> SwitchingSeries:
+        """What ``smooth`` gives; ``others`` are engines that its warning names."""
         run = self._run(problem)
         with Progress(problem.steps, self.label, progress) as bar, quiet():
             filtered, increments = run.forward(partial(bar.advance, 1))
             found = run.smoothed(filtered, lag)
             both = run.whole(filtered), run.whole(found)
-        warn_where_lost(run.data.layouts[0], *both, run.last_rows, run.data.series.start)
+        first = run.data.layouts[0], *both, run.last_rows, run.data.series.start
+        warn_where_lost(*first, others)
         kind = "smooth" if lag is None else "fixed-lag"
         return run.answers(kind, found, increments, queries)
 
