@@ -19,7 +19,7 @@ from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.kalman.reading import why_not_placed
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.marginal.linearised import why_not_bent
-from bayesmc.engines.marginal.tables.plan import MET, TablePlan, nodes_read
+from bayesmc.engines.marginal.tables.plan import TablePlan, nodes_read
 from bayesmc.engines.marginal.tables.search import found_plan, is_finite, named_plan
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError, did_you_mean
@@ -155,7 +155,6 @@ def _found(
         tables, why = found_plan(slices, search.hidden, seen, apart_from, static)
         waits = frozenset() if tables is None else loose & tables.below
         inner = tuple(n for n in numbers.inner if n not in waits)
-        why = {n: w for n, w in why.items() if not w.endswith(MET)}
         return replace(numbers, inner=inner, why={**numbers.why, **why}, tables=tables)
     finite = [n for n in asked if n in search.hidden and is_finite(slices, n)]
     others = tuple(n for n in asked if n not in finite)
