@@ -107,7 +107,7 @@ COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
     "SwitchingKalmanFilter": (bmc.SwitchingKalmanFilter(), 1e-7, ("linear", "switching")),
     "SwitchingKalmanFilter, IMM": (bmc.SwitchingKalmanFilter("imm"), 1e-7, ("switching",)),
     "SwitchingKalmanFilter, GPB1": (bmc.SwitchingKalmanFilter("gpb1"), 1e-7, ("switching",)),
-    "SwitchingKalmanFilter, made linear": (
+    "SwitchingKalmanFilter, linearised": (
         bmc.SwitchingKalmanFilter(linearize=True),
         1e-6,
         ("switching",),

@@ -7,6 +7,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.errors import EvidenceError, QueryError, UnsupportedError
+from tests.engines.test_marginal_tables import ring
 
 ENGINES = [bmc.DiscreteFilter(), bmc.ParticleFilter(50), bmc.ParticleFilter(50, marginalize="auto")]
 
@@ -115,3 +116,10 @@ def test_late_answers_need_what_was_integrated_out():
     told = "'y' is missing in the slice before, and 'm', which is sampled, .*leave delay= out"
     with pytest.raises(UnsupportedError, match=told):
         engine.step(belief, {"y": 0.3})
+
+
+def test_engines_that_cannot_help_are_told_to():
+    """Many cells, one of which is read: no factor over all of them fits."""
+    told = r"of these BoyenKoller\(\) and FactoredFrontier\(\) cannot answer here, either"
+    with pytest.raises(UnsupportedError, match=told):
+        bmc.filter(ring(40, 0.1), {"reading": [1, 0]}, engine=bmc.DiscreteFilter())

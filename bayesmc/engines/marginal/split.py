@@ -45,7 +45,7 @@ class Split:
     why : dict
         Hidden node that is sampled -> why it is not integrated out.
     linearised : dict
-        Node whose mean is made linear at each particle's own mean -> why it must be.
+        Node whose mean is linearised at each particle's own mean -> why it must be.
     tables : TablePlan or None
         Finite nodes that are integrated out.
     """
@@ -187,7 +187,7 @@ class _Search:
             for n, v in model.probe.items()
         } | dict(static)
         self.why: dict[str, str] = {}
-        #: nodes that are made linear, once it is asked for by name
+        #: nodes that are linearised, once it is asked for by name
         self.bent: dict[str, str] | None = None
 
     def found(self) -> Split:
@@ -359,4 +359,4 @@ class _Search:
         if why is None:
             self.bent[name] = reason
             return None
-        return f"{reason}; it cannot be made linear, either: it {why}"
+        return f"{reason}; it cannot be linearised, either: it {why}"

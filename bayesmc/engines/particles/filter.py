@@ -85,7 +85,7 @@ class ParticleFilter(FilterEngine):
         where it names what is missing (an observation, or the slice before slice 0): there the node's own
         density is drawn from. A detector mixed with the transition is a ``Mixture`` of both. ``"optimal"``
         derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
-        is seen is affine in them; else what is seen is made linear, or its log density quadratic, at each
+        is seen is affine in them; else what is seen is linearised, or its log density quadratic, at each
         particle, mixtures of Gaussians component by component, and a tenth of the particles is drawn from
         their own densities. Hidden finite nodes are drawn from their own densities; ``explain`` says what
         guides each node, and why any is not guided. With any proposal vectors are seen whole or not at all.

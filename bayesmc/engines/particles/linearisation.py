@@ -1,12 +1,12 @@
 """A block of hidden numbers as a Gaussian, given the slice before and what was seen below the block.
 
-Means are made linear where the block is expected (central differences) and moments are taken there: an
+Means are linearised where the block is expected (central differences) and moments are taken there: an
 extended Kalman update from a known start, one for every particle. What is seen and is not Gaussian (a count,
 a failure time) corrects that by the derivatives of its log density (``curved``). It gives a density to draw
 the block from and the density of what was seen. Mixtures of Gaussians make a block a mixture, of one such
 belief for each combination of components. Which nodes make a block is not decided here (``optimal``).
 
-Nodes on a circle count differences the short way round.
+Differences of nodes on a circle are wrapped.
 
 References
 ----------
@@ -42,7 +42,7 @@ from bayesmc.network.forward import Pass, summed
 
 #: balances the rounding of a central difference against its curvature
 _STEP = float(np.finfo(float).eps ** (1 / 3))
-#: times that means are made linear anew, where the block is now expected
+#: times that means are linearised anew, where the block is now expected
 _TURNS = 5
 #: standard deviations by which the block may still have moved in the last of them
 _STILL = 0.01
@@ -132,7 +132,7 @@ class LookAhead:
     def believed(self, state: Pass) -> Belief:
         """The block given its parents, whose values are in place, and what was seen.
 
-        Means that are not affine are made linear again where the block is then expected (Gauss-Newton steps).
+        Means that are not affine are linearised again where the block is then expected (Gauss-Newton steps).
         """
         shape = (*state.batch, *self.lead)
         mean, cov = np.zeros((*shape, self.total)), np.zeros((*shape, self.total, self.total))
@@ -253,7 +253,7 @@ class LookAhead:
         return Belief(moved, cov, log_before + log)
 
     def _updated(self, state: Pass, name: str, belief: Belief, point: np.ndarray) -> Belief:
-        """The belief given the value of one seen node, made linear at a point."""
+        """The belief given the value of one seen node, linearised at a point."""
         mean, cov, log_density = belief
         node = self.model[name]
         size = numbers_of(self.model, name, self.apart)

@@ -44,7 +44,7 @@ class SwitchingKalmanFilter(SwitchingEngine):
     linearize : bool
         Makes functions that are not affine linear at each mode's mean by their derivatives, as
         ``ExtendedKalmanFilter`` does; otherwise templates with such are refused. Readings that are angles
-        (``WrappedNormal``, ``VonMises``) count the short way round; hidden angles are refused, and angles
+        (``WrappedNormal``, ``VonMises``) have wrapped residuals; hidden angles are refused, and angles
         that are missing in some row.
     max_modes : int
         Modes above which it refuses.
