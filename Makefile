@@ -25,24 +25,24 @@ help:
 	@echo "make references  hold bayesmc against BUGS and posteriordb, beside JAGS and PyMC: docs/accuracy.md (long)"
 	@echo "make clean   remove what the other targets made"
 
-demo: .venv/.extras-plot,robotics
+demo: .venv/.extras-plot,robotics,vision
 	$(PY) -m examples.demo
 
 # Bytecode is kept, in .venv, also where the environment says not to: many tests start a Python of their own.
 TEST = PYTHONDONTWRITEBYTECODE= PYTHONPYCACHEPREFIX="$(CURDIR)/.venv/bytecode" OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -q \
 	-n auto --dist worksteal
 
-test: .venv/.extras-plot,arviz,robotics,fast,test
+test: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	$(TEST)
 
 # the last lines say the seed; `make test-thorough BAYESMC_SEED=N` takes it again
-test-thorough: .venv/.extras-plot,arviz,robotics,fast,test
+test-thorough: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	$(TEST) --bayesmc-thorough
 
-mutants: .venv/.extras-plot,arviz,robotics,fast,test
+mutants: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.mutants
 
-alarms: .venv/.extras-plot,arviz,robotics,fast,test
+alarms: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.alarms
 
 lint: .venv/.extras-dev
@@ -54,21 +54,21 @@ format: .venv/.extras-dev
 	$(PY) -m ruff check --fix-only -q .
 	$(PY) -m ruff format .
 
-counts: .venv/.extras-plot,arviz,robotics,fast,test
+counts: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.counts
 
-docs: .venv/.extras-plot,arviz,robotics,fast,test .venv/.extras-plot,arviz,robotics,docs
+docs: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test .venv/.extras-plot,arviz,robotics,vision,docs
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
 	OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -q -W --keep-going -b html docs out/site
 	@echo "the site is in out/site/index.html"
 
-bench: .venv/.extras-plot,arviz,robotics,fast,test
+bench: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	$(PY) -m benchmarks
 
 peers: .venv-peers/.installed
 
 # BAYESMC_DATA says where the published posteriors are
-references: .venv/.extras-plot,arviz,robotics,fast,test
+references: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	$(PY) -m references
 
 clean:

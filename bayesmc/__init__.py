@@ -8,7 +8,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import Explanation, explain, filter, forecast, infer, most_likely, smooth
+from bayesmc.auto import (
+    Explanation,
+    explain,
+    filter,
+    forecast,
+    infer,
+    infer_many,
+    load,
+    most_likely,
+    prior_predict,
+    smooth,
+)
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
@@ -61,6 +72,7 @@ from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.particles.islands import IslandFilter
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
@@ -69,10 +81,12 @@ from bayesmc.engines.variational.mean_field import MeanField
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
+from bayesmc.learning import Fit, fit
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
-from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
+from bayesmc.results import Elpd, Marginal, Posterior, SeriesPosterior, Summary, compare
+from bayesmc.storage import CheckpointFile
 from bayesmc.structure.log_density import log_density
 
 if TYPE_CHECKING:
@@ -90,11 +104,13 @@ __all__ = [
     "BoyenKoller",
     "Categorical",
     "Cauchy",
+    "CheckpointFile",
     "Density",
     "Dirichlet",
     "DiscreteFilter",
     "DiscreteUniform",
     "DynamicBayesNet",
+    "Elpd",
     "Distribution",
     "Exact",
     "ExpectationPropagation",
@@ -103,6 +119,7 @@ __all__ = [
     "ExtendedKalmanFilter",
     "FactorGraph",
     "FactoredFrontier",
+    "Fit",
     "Gamma",
     "Geometric",
     "GridFilter",
@@ -115,6 +132,7 @@ __all__ = [
     "InverseCdf",
     "InverseGamma",
     "InverseWishart",
+    "IslandFilter",
     "Joint",
     "KLD",
     "KalmanFilter",
@@ -153,17 +171,22 @@ __all__ = [
     "Weibull",
     "Wishart",
     "WrappedNormal",
+    "compare",
     "errors",
     "explain",
     "filter",
+    "fit",
     "forecast",
     "infer",
+    "infer_many",
     "io",
+    "load",
     "log_density",
     "map",
     "markov",
     "montecarlo",
     "most_likely",
+    "prior_predict",
     "smooth",
     "stack",
 ]
@@ -171,6 +194,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """What not every program needs loads when first asked for."""
-    if name in ("io", "markov", "montecarlo", "plotting", "robotics", "testing"):
+    if name in ("io", "markov", "montecarlo", "plotting", "robotics", "testing", "vision"):
         return importlib.import_module(f"bayesmc.{name}")
     raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")

@@ -208,8 +208,30 @@ class FileFormatError(BayesmcError, ValueError):
         self.line = line
 
 
+class DamagedFileError(FileFormatError):
+    """A file of ours is cut off, or is not what was written.
+
+    Attributes
+    ----------
+    blocks : int
+        How many of its blocks are whole.
+    """
+
+    def __init__(self, message: str, blocks: int = 0) -> None:
+        super().__init__(message)
+        self.blocks = blocks
+
+
+class CheckpointError(BayesmcError, RuntimeError):
+    """A run cannot be saved, or its file belongs to another one."""
+
+
 class MissingExtraError(BayesmcError, ImportError):
     """An optional dependency is not installed; the message says which extra brings it."""
+
+
+class WorkerError(BayesmcError, RuntimeError):
+    """What an executor was asked to do does not travel to its workers, or they were lost over and over."""
 
 
 class BayesmcWarning(UserWarning):
@@ -254,6 +276,10 @@ class ModelMisfitWarning(BayesmcWarning):
 
 class EngineWarning(BayesmcWarning):
     """An option has another engine answer than would without it, or an engine leaves something out."""
+
+
+class WorkerWarning(BayesmcWarning):
+    """A worker of an executor was lost; what it was at is run again."""
 
 
 class LogWarning(BayesmcWarning):

@@ -59,6 +59,12 @@ def stream(seed: np.random.SeedSequence, purpose: Purpose, unit: int = 0) -> np.
     return np.random.Generator(np.random.SFC64(child))
 
 
+def child(seed: np.random.SeedSequence, unit: int) -> np.random.SeedSequence:
+    """The seed of one of many questions that are asked together."""
+    key = (*seed.spawn_key, _QUESTIONS, unit)
+    return np.random.SeedSequence(seed.entropy, spawn_key=key, pool_size=seed.pool_size)
+
+
 def resumed(state: Any) -> np.random.Generator:
     """A generator that goes on where another one of ``stream`` was; ``state`` is its bit generator's."""
     bits = np.random.SFC64(_ANY)
@@ -66,5 +72,7 @@ def resumed(state: Any) -> np.random.Generator:
     return np.random.Generator(bits)
 
 
+#: marks seeds of many questions: no purpose has this number
+_QUESTIONS = 0xB2
 #: of a generator whose state is overwritten
 _ANY = np.random.SeedSequence(0)

@@ -17,6 +17,7 @@ from benchmarks import (
     bench_scale,
     bench_switching,
     bench_time,
+    bench_vision,
     bench_weighting,
     prices,
 )
@@ -54,3 +55,5 @@ if __name__ == "__main__":
         bench_fading.main()
         print()
         bench_robot_logs.main()
+        print()
+        bench_vision.main()

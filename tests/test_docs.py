@@ -14,6 +14,10 @@ PAGES = [REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.m
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # a snippet may write files
+    first = page.read_text("utf-8").partition("\n")[0]
+    if first.startswith("<!-- needs: "):
+        for module in first.removeprefix("<!-- needs: ").removesuffix(" -->").split(", "):
+            pytest.importorskip(module, reason=f"{module}, which the page needs, is not installed")
     run_page(page)
 
 

@@ -25,11 +25,13 @@ PACKAGE = Path(__file__).resolve().parents[1] / "bayesmc"
 # Top to bottom. A package counts as one room; rooms on one line do not import each other.
 LAYERS = """
 __main__
-robotics | plotting | io | testing
+robotics | vision | plotting | io | testing
+learning
 auto
 pmcmc
 engines
 kernels
+workers
 dbn | structure | results
 network
 factors | montecarlo
@@ -37,7 +39,7 @@ passes | lowering
 distributions
 expression
 linalg
-resampling | gaussian | diagnostics | markov | plates | states | randomness | progress
+resampling | gaussian | diagnostics | markov | plates | states | randomness | progress | storage
 categorical
 errors | shapes
 """
@@ -55,7 +57,8 @@ LONG_FUNCTIONS: set[str] = set()
 TYPE_CIRCLES: set[str] = set()
 
 HEAVY = ("scipy.stats", "networkx", "arviz_stats", "arviz_base", "matplotlib", "hypothesis",
-         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas")  # fmt: skip
+         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas", "h5py", "h5netcdf",
+         "skimage", "sklearn")  # fmt: skip
 
 
 def violations(sources: dict[str, str]) -> list[str]:

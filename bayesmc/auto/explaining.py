@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from bayesmc.auto.choosing import explained_series
 from bayesmc.auto.explanation import Explanation
-from bayesmc.auto.series import explained_series
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine

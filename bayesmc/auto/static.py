@@ -7,6 +7,7 @@ from typing import Any
 
 from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.files import Opened
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import Laplace
@@ -22,6 +23,7 @@ from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
+from bayesmc.workers import check_executor
 
 #: bytes up to which an exact answer counts as cheap
 _CHEAP = 256 * 2**20
@@ -37,6 +39,8 @@ def infer(
     progress: bool | None = None,
     keep: str | Sequence[str] = "draws",
     resume: Posterior | None = None,
+    checkpoint: Any = None,
+    executor: Any = None,
 ) -> Posterior:
     """The posterior of a net, of a factor graph, or of a template over all its slices, given evidence.
 
@@ -56,11 +60,19 @@ def infer(
         The same seed gives the same result.
     progress : bool, optional
         Show a bar for what takes over a second; None: on a terminal.
-    keep : "draws", "summaries" or a list of node names
+    keep : "draws", "summaries", "file", a list of node names, or {"file": a list of node names}
         What to hold: all draws; means, variances and probabilities alone, in constant memory; or the
-        draws of some nodes.
+        draws of some nodes. ``"file"`` leaves draws in the file of ``checkpoint``, from which the posterior
+        reads them.
     resume : Posterior, optional
         An earlier posterior of the same question whose draws are continued; ``engine`` may be left out then.
+    checkpoint : path or CheckpointFile, optional
+        A file in which the run saves itself as it goes on (the extra ``netcdf``). The same call goes on where
+        the run was, whatever happened to the process, and ends with the same bits as one that was never
+        stopped; once it has ended, the call returns the answer that is in the file.
+    executor : concurrent.futures.Executor, optional
+        Who works out units of work (chunks of draws, groups of chains): processes, threads, Dask, MPI. The
+        same seed gives the same bits with any, and with none; engines whose work is one unit run here.
 
     Returns
     -------
@@ -70,6 +82,10 @@ def infer(
     ------
     ModelError, EvidenceError, UnsupportedError
         With the node's name, the fault and the fix.
+    CheckpointError, DamagedFileError
+        The file is of another run, and the message says what differs; the disk is full; or it was cut off.
+    WorkerError
+        A function does not travel to the executor's workers, or these were lost over and over.
 
     Examples
     --------
@@ -80,20 +96,51 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
+    if executor is not None:
+        check_executor("infer", executor)
     problem = pose_any(net, evidence, inputs, resume)
-    _check_keep(keep, problem)
+    check_keep("infer", keep, problem, checkpoint)
     if engine is None and resume is not None:
         engine = resume.engine
-    chosen = _choose(problem)[0] if engine is None else _checked(engine)
+    opened = None if checkpoint is None else _opened(checkpoint, problem, resume)
+    if engine is None and opened is not None:
+        engine = opened.engine
+    chosen = able(problem, engine)
+    spread = {"executor": executor} if executor is not None and chosen.spreads else {}
+    if opened is None:
+        found = chosen.run(problem, seed_sequence(rng), keep, progress, resume, **spread)
+    else:
+        found = _run_saved(opened, chosen, rng, keep, progress, spread)
+    return checked_answer(chosen, found)
+
+
+def able(problem: Problem, engine: Any) -> Any:
+    """The engine that answers a posed problem: the one asked for, or one that is chosen.
+
+    Raises
+    ------
+    UnsupportedError
+        With one that can.
+    """
+    chosen = choice(problem) if engine is None else _checked(engine)
     reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
     if reason is not None:
         raise UnsupportedError(_with_alternative(reason, chosen, problem))
-    found = chosen.run(problem, seed_sequence(rng), keep, progress, resume)
+    return chosen
+
+
+def checked_answer(engine: Any, found: Any) -> Posterior:
+    """What an engine returned, refused if it is no posterior."""
     if not isinstance(found, Posterior):
         raise TypeError(
-            f"{type(chosen).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
+            f"{type(engine).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
         )
     return found
+
+
+def choice(problem: Problem) -> Any:
+    """The engine that answers where the user names none."""
+    return _choose(problem)[0]
 
 
 def explained(
@@ -179,6 +226,40 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
     return weighting, ("every hidden node can be sampled given its parents",), refused
 
 
+def _opened(checkpoint: Any, problem: Problem, resume: Posterior | None) -> Opened:
+    if resume is not None:
+        raise ValueError(
+            "infer(resume=..., checkpoint=...): checkpoint= goes on with its own run; give one of both "
+            "(resume=bmc.load(path, net=net) adds draws to a run that has ended)"
+        )
+    return Opened("infer", checkpoint, problem)
+
+
+def _run_saved(
+    opened: Opened,
+    engine: Any,
+    rng: Any,
+    keep: Any,
+    progress: bool | None,
+    spread: Mapping[str, Any],
+) -> Any:
+    """The answer of a run that is saved as it goes on."""
+    if (keep == "file" or isinstance(keep, Mapping)) and not engine.saves:
+        raise UnsupportedError(
+            f"infer(keep={keep!r}): {type(engine).__name__} makes no draws that could stay in a file; leave "
+            "keep= out"
+        )
+    seed = opened.seed(rng)
+    file, answer = opened.begin(engine, seed, keep, {})
+    if file is None:
+        return answer
+    if engine.saves:
+        return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file, **spread)
+    found = engine.run(opened.problem, seed, keep, progress, None, **spread)
+    file.finish(found)
+    return found
+
+
 def _checked(engine: Any) -> Any:
     if (
         isinstance(engine, Laplace) and engine.is_standard
@@ -210,16 +291,22 @@ def _with_alternative(reason: str, engine: Any, problem: Problem) -> str:
     return f"{reason}; {type(other).__name__}() can answer this"
 
 
-def _check_keep(keep: Any, problem: Problem) -> None:
-    if isinstance(keep, str):
-        if keep not in ("draws", "summaries"):
-            raise ValueError(
-                f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names'
-            )
+def check_keep(call: str, keep: Any, problem: Problem, checkpoint: Any = None) -> None:
+    """Refuse a ``keep`` that names neither a way to keep draws nor nodes."""
+    choices = (
+        'give "draws", "summaries", "file", a list of node names, or {"file": a list of node names}'
+    )
+    in_file = keep == "file" or (isinstance(keep, Mapping) and [*keep] == ["file"])
+    if in_file and checkpoint is None:
+        raise ValueError(f'{call}(keep={keep!r}): in which file? give checkpoint="run.nc"')
+    listed = keep["file"] if in_file and isinstance(keep, Mapping) else keep
+    if isinstance(listed, str):
+        if isinstance(keep, Mapping) or keep not in ("draws", "summaries", "file"):
+            raise ValueError(f"{call}(keep={keep!r}): {choices}")
         return
-    if not isinstance(keep, Sequence):
-        raise ValueError(f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names')
-    for name in keep:
+    if not isinstance(listed, Sequence):
+        raise ValueError(f"{call}(keep={keep!r}): {choices}")
+    for name in listed:
         if name not in problem.model.nodes:
             hint = did_you_mean(name, problem.model.nodes)
-            raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node{hint}")
+            raise UnknownNodeError(f"{call}: keep= names {name!r}, which is not a node{hint}")

@@ -16,6 +16,9 @@ from bayesmc.errors import BayesmcError, ModelError
 from bayesmc.network import Model
 from bayesmc.network.node import observed_links
 
+#: in a problem's cache: rows are not to be held against what was expected, for askers of the evidence alone
+UNCOMPARED = "rows are not compared"
+
 
 @dataclass(frozen=True, eq=False)
 class SeriesProblem:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 from collections.abc import Iterable, KeysView
 from typing import Any
 
@@ -107,6 +108,14 @@ def read_floats(value: Any) -> np.ndarray:
             f"a distribution's parameter is {value!r}, which is text, not numbers; give {numbers.tolist()}"
         )
     return numbers
+
+
+def as_number(value: Any) -> float:
+    """A single number as a float; NaN for anything else, text included."""
+    try:
+        return math.nan if isinstance(value, (str, bytes)) or np.ndim(value) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 def _holds_text(value: Any) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -44,11 +44,32 @@ class Treatment:
         return f"{self.kernel}: {self.why}" if self.kernel and self.why else self.kernel or self.why
 
 
+def kept_names(keep: Any, problem: Problem) -> tuple[tuple[str, ...], bool, bool]:
+    """The nodes whose draws are wanted, whether as sums alone, and whether they stay in the file of a run.
+
+    Parameters
+    ----------
+    keep : "draws", "summaries", "file", sequence of str, or {"file": sequence of str}
+        As in ``infer``.
+    """
+    free = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
+    if isinstance(keep, str):
+        return free, keep == "summaries", keep == "file"
+    if isinstance(keep, Mapping):
+        return tuple(keep["file"]), False, True
+    return tuple(keep), False, False
+
+
 class Engine:
     """Base of the engines; a family supplies ``refusal``, ``describe`` and ``run``.
 
     ``infer`` is the way in. An engine that cannot answer says why and names one that can.
     """
+
+    #: whether ``run`` takes ``checkpoint=`` and saves itself as it goes on; others are saved at the end
+    saves: ClassVar[bool] = False
+    #: whether its work comes in units, so that ``run`` takes an ``executor``
+    spreads: ClassVar[bool] = False
 
     def unsupported(
         self,

@@ -6,6 +6,7 @@ belief=...)`` has given it the template again.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Any
@@ -15,18 +16,53 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, DynamicBayesNet, Row, Slices
 from bayesmc.errors import ModelError, QueryError
 from bayesmc.network import CompiledNode, Model
-from bayesmc.results import SeriesPosterior
+from bayesmc.results import SeriesPosterior, save
+from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.series import no_joint_table
 
 
 class OnlineBelief:
     """Base of the beliefs about one slice: values that never change, so a copy is the belief itself."""
 
+    @property
+    def _as_series(self) -> MarginalAnswers:
+        """The answers about a series of this one slice."""
+        raise NotImplementedError
+
+    def median(self, name: str) -> np.ndarray:
+        """Median, shape ``(*plates, *event)``."""
+        return self._as_series.median(name)[0]
+
+    def hdi(self, name: str, prob: float = 0.89) -> np.ndarray:
+        """Narrowest intervals that hold each number with probability ``prob``, ``(*plates, *event, 2)``."""
+        return self._as_series.hdi(name, prob)[0]
+
+    def mode(self, name: str) -> np.ndarray:
+        """Where the marginal of each number is highest; labels where states have some."""
+        return self._as_series.mode(name)[0]
+
+    def cdf(self, name: str, points: Any) -> np.ndarray:
+        """Probabilities that each number is at or below some points, ``(*points.shape, *plates, *event)``."""
+        return self._as_series.cdf(name, points)[0]
+
+    def entropy(self, name: str) -> np.ndarray:
+        """Entropy of each number in nats, shape ``(*plates, *event)``."""
+        return self._as_series.entropy(name)[0]
+
     def __copy__(self) -> Any:
         return self
 
     def __deepcopy__(self, memo: Any) -> Any:
         return self
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file; it goes on with ``engine.start(dbn, belief=bmc.load(path))``.
+
+        Raises
+        ------
+        MissingExtraError, CheckpointError
+        """
+        save(self, path)
 
 
 class SliceBelief(OnlineBelief):
@@ -94,6 +130,11 @@ class SliceBelief(OnlineBelief):
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
             )
         return self._answered()
+
+    @property
+    def _as_series(self) -> MarginalAnswers:
+        found: MarginalAnswers = self._posterior
+        return found
 
     def _answered(self) -> SeriesPosterior:
         """The posterior; it is worked out once."""

@@ -81,13 +81,13 @@ class FilterEngine:
     answer.
     """
 
-    #: what stands beside the progress bar
-    label: ClassVar[str] = ""
+    label: ClassVar[str] = ""  #: what stands beside the progress bar
     #: whether it has particles that can be kept, and whether it answers for functions of nodes
     keeps: ClassVar[bool] = False
     #: what its ``start`` and ``step`` return
     belief: ClassVar[type] = object
     takes_queries: ClassVar[bool] = True
+    spreads: ClassVar[bool] = False  #: whether ``filter`` takes an ``executor``
     #: whether its answers are the model's, up to rounding
     is_exact: ClassVar[bool] = False
 

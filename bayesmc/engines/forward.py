@@ -31,10 +31,15 @@ _BITS = 31
 
 def chunk_sizes(model: Model, draws: int) -> list[int]:
     """Draws in each chunk: about ``CHUNK``, fewer for plated nodes, and all about the same."""
+    count = chunk_count(model, draws)
+    return [draws // count + (k < draws % count) for k in range(count)]
+
+
+def chunk_count(model: Model, draws: int) -> int:
+    """How many chunks there are."""
     largest = max((math.prod(n.value_shape) for n in model.nodes.values()), default=1)
     size = max(1, min(CHUNK, _CHUNK_ELEMENTS // max(largest, 1)))
-    count = max(1, round(draws / size))
-    return [draws // count + (k < draws % count) for k in range(count)]
+    return max(1, round(draws / size))
 
 
 def fast_steps(

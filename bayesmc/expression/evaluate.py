@@ -163,7 +163,8 @@ def shaped(
     pooled, shapes = buffers.pool()
     if pooled:  # taken out while they are in use, so that calls at a time have their own
         scope["free"], scope["new"] = [], lambda: [np.empty(shape) for shape in shapes]
-        lines.append("pool = free.pop() if free else new()")
+        # in one step: another thread may take the last one between a look and a pop
+        lines += ["try: pool = free.pop()", "except IndexError: pool = new()"]
     for k, node in enumerate(ordered(*roots)):
         names[node] = f"t{k}"
         if isinstance(node, Leaf):

@@ -213,6 +213,30 @@ def plate_sizes(
     return sizes
 
 
+def brought_sizes(model: Model, inputs: Mapping[str, Any] | None) -> dict[str, int]:
+    """Sizes of plates that new values of inputs bring along, where they are not the model's.
+
+    Raises
+    ------
+    PlateError
+        Two inputs bring different ones.
+    """
+    found: dict[str, int] = {}
+    for name, value in (inputs or {}).items():
+        node = model.nodes.get(name)
+        shape = _shape(value)
+        if node is None or node.kind != "input" or len(shape) < len(node.plates):
+            continue  # said when the value is read
+        for plate, size in zip(node.plates, shape, strict=False):
+            if found.setdefault(plate, size) != size:
+                raise PlateError(
+                    f"the new inputs bring {found[plate]} and {size} ({name!r}) elements of plate "
+                    f"{plate!r}; give all "
+                    "inputs of a plate for the same elements"
+                )
+    return {plate: size for plate, size in found.items() if model.sizes[plate] != size}
+
+
 def store(node: CompiledNode, value: Any) -> np.ndarray:
     """Complete user values (any batch axes in front) as stored values; faults name the node."""
     try:

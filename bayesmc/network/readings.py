@@ -19,6 +19,7 @@ from bayesmc.distributions import (
     Categorical,
     Density,
     Distribution,
+    Joint,
     Mixture,
     Truncated,
     as_distribution,
@@ -392,6 +393,8 @@ def _ranks(family: Family) -> dict[str, int]:
         return {}
     if make is Mixture:
         return {"weights": 1, "components": int(isinstance(parameters["components"], Family))}
+    if isinstance(make, type) and issubclass(make, Joint):
+        return {}
     known = getattr(make, "parameter_ndim", None)
     if not known:
         raise TraceError("the axes of its parameters are not known")

@@ -172,7 +172,7 @@ def _same(a: Any, b: Any, met: _Met, depth: int) -> bool | None:
             return False
         pairs = [(a[k], b[k]) for k in a]
     else:
-        one, other = _parts(a), _parts(b)
+        one, other = parts_of(a), parts_of(b)
         if one is None or other is None:
             return False if isinstance(a, DEFINED) else None
         if len(one) != len(other):
@@ -192,7 +192,7 @@ _OF_CODE = ("co_code", "co_names", "co_varnames", "co_freevars", "co_cellvars", 
             "co_kwonlyargcount", "co_flags", "co_consts")  # fmt: skip
 
 
-def _parts(value: Any) -> list[Any] | None:
+def parts_of(value: Any) -> list[Any] | None:
     """What a value is made of; None of one that cannot be looked into."""
     if isinstance(value, np.ndarray):
         return list(value.flat)

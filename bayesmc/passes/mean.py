@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from bayesmc.distributions import (
     Geometric,
     HalfNormal,
     InverseGamma,
+    Joint,
     Laplace,
     LogNormal,
     MvNormal,
@@ -63,9 +64,33 @@ def _mean(density: Any) -> Any:
     if isinstance(density, Distribution):
         return density.mean
     formula = FORMULAS.get(density.make)
+    if formula is None and isinstance(density.make, type) and issubclass(density.make, Joint):
+        return _side_by_side(density)
     if formula is None:
         raise TraceError(f"the mean of {getattr(density.make, '__name__', density.make)}")
     return formula(**{k: _operand(v) for k, v in density.parameters.items()})
+
+
+def _side_by_side(density: Family) -> Any:
+    """Of parts of a vector, each a number or a vector."""
+    columns = []
+    for part in _parts(density.parameters.values()):
+        is_vector = isinstance(part, MvNormal) or getattr(part, "make", None) is MvNormal
+        if not is_vector and getattr(part, "event_shape", None):
+            raise TraceError(f"the mean of {type(part).__name__} within a Joint")
+        own = _mean(part)
+        columns.append(own if is_vector else np.expand_dims(own, -1))
+    lead = np.broadcast_shapes(*(np.shape(c)[:-1] for c in columns))
+    wide = [np.broadcast_to(c, (*lead, np.shape(c)[-1])) for c in columns]
+    return np.concatenate(wide, axis=-1)
+
+
+def _parts(values: Iterable[Any]) -> Iterator[Any]:
+    for value in values:
+        if isinstance(value, (list, tuple)):
+            yield from _parts(value)
+        else:
+            yield value
 
 
 def _operand(value: Any) -> Any:

@@ -46,6 +46,8 @@ class ParticleGibbs(ParticleEngine):
         Sweeps per kept draw.
     start : dict, optional
         Node -> where its chains start, as for `Gibbs`; of static nodes, since a filter draws trajectories.
+    groups : int, optional
+        Groups of chains that run apart, as for `Gibbs`.
 
     Raises
     ------
@@ -82,6 +84,7 @@ class ParticleGibbs(ParticleEngine):
     particles: int = 50
     thinning: int = 1
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+    groups: int | None = None
 
     label: ClassVar[str] = "particle Gibbs"
 

@@ -43,6 +43,8 @@ class ParticleMetropolis(ParticleEngine):
         particles, and rises with that of rows). By default as many as it takes for that, from 50 to 5,000, by
         a look at the posterior before the warmup, where chains start, too; the warmup measures the error, and
         over 2 there is a warning.
+    groups : int, optional
+        Groups of chains that run apart, as for `Gibbs`.
 
     Raises
     ------
@@ -82,6 +84,7 @@ class ParticleMetropolis(ParticleEngine):
     particles: int | None = None
     thinning: int = 1
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+    groups: int | None = None
 
     label: ClassVar[str] = "particle Metropolis"
 

@@ -1,10 +1,12 @@
 """Results: posteriors that answer the same queries whatever made them."""
 
 from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint
+from bayesmc.results.criteria import Elpd, compare
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.running import Sums
+from bayesmc.results.saving import RunFile, save
 from bayesmc.results.series import SeriesPosterior
 from bayesmc.results.sums import RunningChains, SumsPosterior
 from bayesmc.results.table import Summary
@@ -14,11 +16,15 @@ __all__ = [
     "ChainsSums",
     "Checkpoint",
     "DrawsPosterior",
+    "Elpd",
     "Marginal",
     "Posterior",
+    "RunFile",
     "RunningChains",
     "SeriesPosterior",
     "Summary",
     "Sums",
     "SumsPosterior",
+    "compare",
+    "save",
 ]

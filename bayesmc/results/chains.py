@@ -309,6 +309,10 @@ class ChainsSums(_Chains, SumsPosterior):
         labelled = node.domain is not None and node.domain.labels is not None
         return series.reshape((*shape, -1) if labelled else shape)
 
+    def bind(self, problem: Problem) -> None:
+        super().bind(problem)
+        self._running._sums.model = problem.model
+
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
         return {**state, "_running": self._running.with_model(state["model"])}

@@ -17,22 +17,21 @@ from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network import Problem, forward, read_inputs
+from bayesmc.network.evidence import brought_sizes
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
+from bayesmc.results.assessed import AssessedByDraws
 from bayesmc.results.datatree import datatree
+from bayesmc.results.laws import DrawnLaws, Laws
 from bayesmc.results.marginal import Marginal
-from bayesmc.results.posterior import (
-    Posterior,
-    circular_variance,
-    near,
-    quantile_levels,
-    whole_draws,
-)
+from bayesmc.results.over_time import expanded
+from bayesmc.results.posterior import Posterior, quantile_levels, whole_draws
 from bayesmc.results.query import Query
 from bayesmc.results.shares import chain_count, is_share, slowest, steps, weighted_count
+from bayesmc.results.statistics import circular_variance, near
 
 
-class DrawsPosterior(Posterior):
+class DrawsPosterior(AssessedByDraws, Posterior):
     """Queries answered from draws.
 
     Parameters
@@ -124,7 +123,8 @@ class DrawsPosterior(Posterior):
         """
         if not names:
             raise UnknownNodeError("cov(): name at least one node")
-        blocks = [self._uncut(name, "cov").reshape(*self._shape, -1) for name in names]
+        every = expanded(self.model, names)
+        blocks = [self._uncut(name, "cov").reshape(*self._shape, -1) for name in every]
         flat = np.concatenate(blocks, axis=-1)
         flat = (flat - self._average(flat)).reshape(-1, flat.shape[-1])
         matrix = (flat * self._flat_weights()[:, None]).T @ flat
@@ -164,6 +164,15 @@ class DrawsPosterior(Posterior):
         if weights is None:
             table /= len(flat)
         return table.reshape(sizes + cards)
+
+    def _laws(self, name: str) -> Laws:
+        node = self._node(name)
+        if node.domain is not None and not node.event_shape:
+            return super()._laws(name)
+        values = self._uncut(name, "hdi, mode, cdf and entropy")
+        flat = values.reshape((math.prod(self._shape), *values.shape[2:]))
+        weights = None if self.weights is None else self.weights.ravel()
+        return DrawnLaws(flat, weights, node.is_discrete)
 
     # ---- functions ---------------------------------------------------------------------------
 
@@ -247,7 +256,7 @@ class DrawsPosterior(Posterior):
     ) -> DrawsPosterior:
         problem = self._live("predict")
         listed = isinstance(names, Sequence) and not isinstance(names, str)
-        wanted: tuple[str, ...] = tuple(names) if listed else (names,)  # type: ignore[assignment]
+        wanted = tuple(expanded(self.model, names if listed else [names]))
         for name in wanted:
             if not isinstance(name, str):
                 raise UnknownNodeError(
@@ -270,6 +279,7 @@ class DrawsPosterior(Posterior):
         rng: np.random.Generator,
     ) -> DrawsPosterior:
         given = problem.inputs if inputs is None else inputs
+        plates = {**brought_sizes(self.model, inputs), **plates}
         model = problem.net.model(None, given, {**self.model.sizes, **plates})
         forward.refuse_potentials(model, wanted, "predict")
         declarations = {n: c.declaration for n, c in model.nodes.items()}

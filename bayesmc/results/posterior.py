@@ -6,17 +6,25 @@ comes about (from draws, from sums, from exact tables) is each subclass's own af
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
+from html import escape
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
+from bayesmc.network.fingerprint import fingerprint
+from bayesmc.results.assessed import Assessed
+from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal import Marginal
+from bayesmc.results.marginal_answers import MarginalAnswers
+from bayesmc.results.over_time import expanded, take_templates
 from bayesmc.results.query import Query
+from bayesmc.results.saving import save
 from bayesmc.results.table import Summary
 
 Plates = str | Sequence[str]
@@ -36,7 +44,8 @@ def quantile_levels(name: str, q: Any) -> np.ndarray:
     return levels
 
 
-class Posterior:
+@take_templates
+class Posterior(Assessed, MarginalAnswers):
     """Answers about the nodes of a net given evidence.
 
     Attributes
@@ -62,11 +71,18 @@ class Posterior:
 
     log_marginal_likelihood: float | None = None
     log_marginal_likelihood_mcse: float | None = None
+    #: inputs of the question, where the problem is lost
+    _known: Mapping[str, np.ndarray] = MappingProxyType({})
     #: importance weights normalised to sum to 1, shape (chain, draw); None where uniform or exact
     weights: np.ndarray | None = None
     log_weights: np.ndarray | None = None
     weight_ess: float | None = None
     pareto_k: float | None = None
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Answers about one node take a template's node, too: all its slices, stacked (``over_time``)."""
+        super().__init_subclass__(**options)
+        take_templates(cls)
 
     def __init__(self, problem: Problem, engine: Any) -> None:
         self.problem: Problem | None = problem
@@ -203,6 +219,13 @@ class Posterior:
 
     # ---- what a posterior of its own kind knows of a node, by name, or of a query ----------------
 
+    def _laws(self, name: str) -> Laws:
+        node = self._node(name)
+        if node.domain is None or node.event_shape:
+            raise self._cannot(f"hdi, mode, cdf and entropy of {name!r}")
+        numbers = None if _is_labelled(node) else np.asarray(node.domain.numbers, dtype=float)
+        return TableLaws(self.probabilities(name), numbers, name)
+
     def _averaged(self, query: Query) -> np.ndarray:
         raise self._cannot("probability" if query.is_event else "expectation")
 
@@ -232,7 +255,8 @@ class Posterior:
 
         By default the nodes that are not wholly observed.
         """
-        chosen = list(names) if names is not None else [n for n in self.names if self._is_free(n)]
+        free = [n for n in self.names if self._is_free(n)]
+        chosen = expanded(self.model, names) if names is not None else free
         labels: list[str] = []
         parts: dict[str, list[np.ndarray]] = {}
         for name in chosen:
@@ -337,7 +361,40 @@ class Posterior:
 
     def _reload(self) -> str:
         """How to have the functions again."""
-        return "declare the net and call infer again, or ask before pickling"
+        return "declare the net and call infer again, or ask before pickling (bmc.load takes net=)"
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file that ``bmc.load`` reads, and ArviZ and xarray, too.
+
+        It is NetCDF-4 (the extra ``netcdf``). Draws are under ``posterior``, weighted ones under
+        ``weighted_posterior``; of answers without draws, means, variances and probabilities under
+        ``answers``. The file takes the place of another one at once or not at all. Functions stay out.
+
+        Parameters
+        ----------
+        path : path
+
+        Raises
+        ------
+        MissingExtraError
+        CheckpointError
+            The disk is full, or may not be written.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet()
+        >>> net.add("die", bmc.DiscreteUniform(1, 6))
+        >>> bmc.infer(net).save("die.nc")  # doctest: +SKIP
+        >>> bmc.load("die.nc").mean("die")  # doctest: +SKIP
+        3.5
+        """
+        problem = self.problem
+        save(self, path, None if problem is None else {"fingerprint": fingerprint(problem.model)})
+
+    def bind(self, problem: Problem) -> None:
+        """Answer with the functions of a problem again, which a file or a pickle carries none of."""
+        self.problem, self.model = problem, problem.model
 
     def _cannot(self, what: str) -> UnsupportedError:
         return UnsupportedError(
@@ -349,7 +406,9 @@ class Posterior:
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
-        return {**self.__dict__, "problem": None, "model": self.model.without_functions()}
+        inputs = self.problem.inputs if self.problem is not None else self._known
+        bare = self.model.without_functions()
+        return {**self.__dict__, "problem": None, "model": bare, "_known": inputs}
 
     def __copy__(self) -> Posterior:
         """A posterior is never changed; copied like a pickle it would lose its functions."""
@@ -357,6 +416,13 @@ class Posterior:
 
     def __deepcopy__(self, memo: Any) -> Posterior:
         return self
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it: the summary, where there is one."""
+        try:
+            return self.summary()._repr_html_()
+        except UnsupportedError as error:
+            return f"<pre>{escape(repr(self))}\n{escape(str(error))}</pre>"
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"
@@ -367,23 +433,6 @@ def whole_draws(draws: Any) -> int:
     if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 1:
         raise ValueError(f"resample(draws={draws!r}): draws is a whole number, 1 or more")
     return int(draws)
-
-
-def table_variance(table: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-    """Variances of numbers under tables of probabilities, shape ``table.shape[:-1]``."""
-    centred = numbers - (table @ numbers)[..., None]
-    return (table * centred**2).sum(axis=-1)
-
-
-def near(angles: np.ndarray, mean: Any) -> np.ndarray:
-    """Angles within half a turn of their mean: what needs an order needs a cut, best opposite the mean."""
-    return mean + wrap_angle(angles - mean)
-
-
-def circular_variance(cosine: Any, sine: Any) -> np.ndarray:
-    """Square of the circular standard deviation, from mean cosine and sine (Mardia and Jupp 2000, 2.3)."""
-    with np.errstate(divide="ignore"):
-        return -np.log(np.minimum(np.asarray(cosine) ** 2 + np.asarray(sine) ** 2, 1.0))
 
 
 def _is_labelled(node: CompiledNode) -> bool:

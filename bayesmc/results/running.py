@@ -6,6 +6,7 @@ scale that its owner changes with ``rescale``. None grows with the number of dra
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -31,6 +32,10 @@ class JointCounts:
     def rescale(self, scale: np.ndarray) -> None:
         """Multiply what was summed by w and by w**2 with the two entries of ``scale``."""
         self.histogram *= scale[:, None]
+
+    def merge(self, other: JointCounts, weight: np.ndarray) -> None:
+        """Take in what another one summed, of a total ``weight`` by w and by w**2, at the same scale."""
+        self.histogram += other.histogram
 
     def with_node(self, name: str, card: int) -> JointCounts:
         return JointCounts((*self.names, name), (*self.cards, card))
@@ -60,6 +65,10 @@ class PlateCounts:
         """See ``JointCounts.rescale``."""
         self.table *= scale[:, None, None]
 
+    def merge(self, other: PlateCounts, weight: np.ndarray) -> None:
+        """See ``JointCounts.merge``."""
+        self.table += other.table
+
     def add(self, codes: np.ndarray, weights: np.ndarray) -> None:
         """Take in positions of shape ``(draws, *plates)``."""
         flat = codes.reshape(len(codes), -1)
@@ -83,6 +92,12 @@ class Moments:
         """See ``JointCounts.rescale``."""
         self.first *= scale[:, None]
         self.second *= scale[:, None]
+
+    def merge(self, other: Moments, weight: np.ndarray) -> None:
+        """See ``JointCounts.merge``."""
+        step, weight = other.centre - self.centre, weight[:, None]
+        self.first += other.first + step * weight
+        self.second += other.second + step * (2 * other.first + step * weight)
 
     def add(self, value: np.ndarray, weights: np.ndarray) -> None:
         """Take in values of shape ``(draws, ...)``."""
@@ -151,6 +166,10 @@ class Turns:
         """See ``JointCounts.rescale``."""
         self.sums *= scale[:, None, None]
 
+    def merge(self, other: Turns, weight: np.ndarray) -> None:
+        """See ``JointCounts.merge``."""
+        self.sums += other.sums
+
     def add(self, value: np.ndarray, weights: np.ndarray) -> None:
         """Take in values of shape ``(draws, ...)``."""
         value = value.reshape(len(value), -1)
@@ -184,6 +203,14 @@ class Tail:
             self._count += above.size
         if self._count > 4 * max(self._needed(), len(self.kept)):
             self.values()
+
+    def merge(self, other: Tail) -> None:
+        """Take in another's."""
+        self.draws += other.draws
+        kept = other.values()
+        if kept.size:
+            self._fresh.append(kept)
+            self._count += kept.size
 
     def values(self) -> np.ndarray:
         """The kept log weights, in no order."""
@@ -244,6 +271,33 @@ class Sums:
             for name, turned in self._turned.items():
                 turned.add(values[name], weights)
         self.weight += weights[0].sum(), weights[0] @ weights[0]
+
+    def without_model(self) -> Sums:
+        """What can be saved of it: the same arrays, and no net."""
+        found = copy.copy(self)
+        found.model = None  # type: ignore[assignment]
+        return found
+
+    def merge(self, other: Sums) -> None:
+        """Take in the sums of other draws of the same question; these are of no use afterwards."""
+        if other._groups is None:
+            return
+        if self._groups is None:
+            self.__dict__.update(other.__dict__)
+            return
+        if other.top > self.top:
+            self._rescale(other.top)
+        elif other.top < self.top:
+            other._rescale(self.top)
+        self.draws += other.draws
+        self.tail.merge(other.tail)
+        for group, theirs in zip(self._groups, other._groups, strict=True):
+            group.merge(theirs, other.weight)
+        for name, single in self._single.items():
+            single.merge(other._single[name], other.weight)  # type: ignore[arg-type]
+        for name, turned in self._turned.items():
+            turned.merge(other._turned[name], other.weight)
+        self.weight += other.weight
 
     @property
     def constant(self) -> frozenset[str]:

@@ -7,6 +7,7 @@ out while the slices passed by. What a family keeps besides (particles, joint co
 from __future__ import annotations
 
 import copy
+import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -14,17 +15,17 @@ import numpy as np
 
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Model
-from bayesmc.results.posterior import quantile_levels, table_variance
-from bayesmc.results.predictive import Predictive
+from bayesmc.results.laws import Laws, NormalLaws, TableLaws, curve_between
+from bayesmc.results.marginal_answers import MarginalAnswers
+from bayesmc.results.posterior import quantile_levels
+from bayesmc.results.saving import save
+from bayesmc.results.series_checks import SeriesChecks
+from bayesmc.results.statistics import table_variance
 
 #: what is asked of answers over time that has another name here, or that only some filters have
 _INSTEAD = {
     "ess": "weight_ess has the effective number of particles of each slice (of a ParticleFilter)",
-    "median": "ask quantile(name, 0.5)",
-    "interval": "ask quantile(name, [0.05, 0.95])",
-    "hdi": "ask quantile(name, [0.05, 0.95])",
-    "mode": "probabilities(name), or density(name) of a GridFilter, say where the belief is highest, and "
-    "most_likely(dbn, observations) the most likely trajectory",
+    "interval": "ask hdi(name, prob) or quantile(name, [0.05, 0.95])",
     "draws": 'a ParticleFilter has particles(name), with keep="particles"',
     "samples": 'a ParticleFilter has particles(name), with keep="particles"',
     "particles": "a ParticleFilter has those",
@@ -36,13 +37,12 @@ _INSTEAD = {
     "cov": 'Kalman filters have those, and a ParticleFilter with keep="particles"',
     "expectation": "give queries={name: function} to the call",
     "probability": "give queries={name: function} to the call, whose mean is the probability of an event",
-    "innovations": "Kalman filters have those; predictive_ranks(name) and row_ranks are every filter's",
     "nis": "Kalman filters have those; row_deficits are every filter's",
     "nis_df": "Kalman filters have those",
 }
 
 
-class SeriesPosterior:
+class SeriesPosterior(SeriesChecks, MarginalAnswers):
     """Beliefs about the nodes of every slice.
 
     Attributes
@@ -99,7 +99,6 @@ class SeriesPosterior:
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None
     rejuvenated: np.ndarray | None = None
-    predictive: Predictive | None = None
     log_marginal_likelihood_mcse: Any = None
     #: errors of means by node, time first; a node that is left out has none
     mean_errors: Mapping[str, np.ndarray] | None = None
@@ -226,66 +225,6 @@ class SeriesPosterior:
         every = np.repeat(mean[:, None], levels.size, axis=1)
         return every.reshape((len(mean), *levels.shape, *mean.shape[1:]))
 
-    @property
-    def row_ranks(self) -> np.ndarray | None:
-        return None if self.predictive is None else self.predictive.row_ranks.copy()
-
-    @property
-    def row_deficits(self) -> np.ndarray | None:
-        return None if self.predictive is None else self.predictive.row_deficits.copy()
-
-    def predictive_ranks(self, name: str) -> np.ndarray:
-        """Where an observed node's values lie among what was expected of them, given the rows before.
-
-        The probability, before the row came, of a smaller value (the probability integral transform): uniform
-        on (0, 1) where the model is right, heaped at both ends where its spread is too small, at one end
-        where it is off to one side. Kalman filters know them; the others count among 19 draws, and
-        break ties by chance, so that ranks of discrete nodes are uniform, too.
-
-        Parameters
-        ----------
-        name : str
-
-        Returns
-        -------
-        ndarray, shape (time, *plates, *event)
-            NaN where it was not seen or not compared (``row_ranks``).
-
-        Raises
-        ------
-        UnknownNodeError, QueryError
-        UnsupportedError
-            The engine does not compare rows with what it expected.
-
-        References
-        ----------
-        Dawid (1984), Statistical theory: the prequential approach, JRSS A 147; Czado, Gneiting and Held
-        (2009), Predictive model assessment for count data, Biometrics 65, for ties.
-
-        Examples
-        --------
-        >>> import bayesmc as bmc
-        >>> dbn = bmc.DynamicBayesNet()
-        >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
-        >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
-        >>> filtered = bmc.filter(dbn, {"y": [0.0, 4.0, 4.5]}, engine=bmc.KalmanFilter())
-        >>> filtered.predictive_ranks("y").round(3).tolist()
-        [0.5, 0.994, 0.904]
-        """
-        if name not in self.model.nodes:
-            raise UnknownNodeError(f"there is no node {name!r}; there are {list(self.model.nodes)}")
-        if self.predictive is None:
-            raise UnsupportedError(
-                f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare "
-                "rows with what was expected of them; ask the result of filter or smooth by a filter (not by "
-                "another engine), with five rows or more, of nodes that random draws can be taken of"
-            )
-        if name not in self.predictive.ranks:
-            raise QueryError(
-                f"predictive_ranks({name!r}): the node is not observed; ask of one that is"
-            )
-        return self.predictive.ranks[name].copy()
-
     def mcse(self, what: Any) -> Any:
         """Monte Carlo standard errors of ``mean(name)``, time first; of each probability, for labels.
 
@@ -330,6 +269,27 @@ class SeriesPosterior:
         found.queries_mcse = cut(self.queries_mcse)
         return found
 
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write it to a file that ``bmc.load`` reads, and xarray: as ``Posterior.save`` does.
+
+        Means, variances and probabilities stand under ``answers``, time first.
+
+        Raises
+        ------
+        MissingExtraError, CheckpointError
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], initial=[0.5, 0.5])
+        >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+        >>> bmc.filter(dbn, {"umbrella": [1, 1]}).save("rain.nc")  # doctest: +SKIP
+        >>> bmc.load("rain.nc").probabilities("rain").shape  # doctest: +SKIP
+        (2, 2)
+        """
+        save(self, path)
+
     def __copy__(self) -> Any:
         """The same answers; unlike a pickle a copy keeps the model's functions."""
         other = object.__new__(type(self))
@@ -346,7 +306,7 @@ class SeriesPosterior:
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
-        return {**self.__dict__, "model": self.model.without_functions()}
+        return {**self.__dict__, "model": self.model.without_functions(), "paths": None}
 
     def __repr__(self) -> str:
         engine = type(self.engine).__name__
@@ -354,6 +314,40 @@ class SeriesPosterior:
         return f"{type(self).__name__}({found}: {', '.join(self.names)})"
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _laws(self, name: str) -> Laws:
+        """Of every slice: tables, what is known, and otherwise what quantiles tell."""
+        node = self._node(name)
+        if name in self._tables:
+            domain = node.domain
+            assert domain is not None
+            labels = domain.labels is not None
+            numbers = None if labels else np.asarray(domain.numbers, dtype=float)
+            return TableLaws(self._tables[name], numbers, name)
+        if self._is_known(name):
+            mean = np.asarray(self._means[name])
+            return NormalLaws(mean, np.zeros(mean.shape))
+        return self._held_laws(name)
+
+    def _held_laws(self, name: str) -> Laws:
+        """Of numbers that are not known."""
+        mean = np.asarray(self._means[name])
+        self.quantile(name, 0.5)  # says why there are none, where there are none
+        return curve_between(mean.shape, lambda q: np.moveaxis(self.quantile(name, q), 1, 0))
+
+    def _is_known(self, name: str) -> bool:
+        """Whether a table or a value says all there is to say."""
+        self._node(name)
+        return name in self._tables or not np.any(self._variances[name])
+
+    def _lead(self) -> int:
+        return 1
+
+    def _answer_shape(self, name: str) -> tuple[int, ...]:
+        node = self._node(name)
+        if name in self._tables:
+            return tuple(self._tables[name].shape[:-1])
+        return (len(self._means[name]), *node.value_shape)
 
     def _node(self, name: str) -> CompiledNode:
         node = self.model.nodes.get(name)

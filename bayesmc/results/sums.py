@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,10 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model, Problem
-from bayesmc.results.posterior import Posterior, circular_variance, table_variance
+from bayesmc.results.posterior import Posterior, quantile_levels
 from bayesmc.results.running import Sums
 from bayesmc.results.shares import steps, weighted_share_count
+from bayesmc.results.statistics import circular_variance, table_quantile, table_variance
 
 #: share of a variance that is rounding
 _NONE = 1e-20
@@ -72,6 +73,14 @@ class SumsPosterior(Posterior):
         self._finite(names[0])
         self._kept(names[0])
         return self._sums.counts(names[0])[0] / self._sums.weight[0]
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Of finite nodes, whose probabilities are summed; numbers are summed by their moments alone."""
+        node = self._numeric(name, "quantile")
+        levels = quantile_levels(name, q)
+        if node.domain is None:
+            raise self._cannot("quantile")
+        return table_quantile(self.probabilities(name), np.asarray(node.domain.numbers), levels)
 
     def _mcse(self, what: Any) -> np.ndarray:
         error = self._error(what)
@@ -171,6 +180,10 @@ class SumsPosterior(Posterior):
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         return {}
 
+    def bind(self, problem: Problem) -> None:
+        super().bind(problem)
+        self._sums.model = problem.model
+
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
         sums = copy.copy(self._sums)
@@ -212,6 +225,25 @@ class RunningChains:
         self._constant: dict[str, np.ndarray] = {}
         self._means: dict[str, _BatchMeans] = {}
 
+    @staticmethod
+    def joined(parts: Sequence[RunningChains]) -> RunningChains:
+        """The chains of several runs of the same length as those of one."""
+        one = parts[0]
+        if len({(part.draws, part.chains) for part in parts}) > 1:
+            raise UnsupportedError(
+                'infer: keep="summaries" cannot put groups of chains of unlike lengths together, as Ctrl-C '
+                'leaves them; keep="draws" can'
+            )
+        found = copy.copy(one)
+        found.chains = sum(part.chains for part in parts)
+        found._sums = Sums(one._sums.model, one.names)
+        for part in parts:
+            found._sums.merge(copy.deepcopy(part._sums, {id(one._sums.model): one._sums.model}))
+        buffers = {n: np.concatenate([p._buffers[n] for p in parts], 1) for n in one._buffers}
+        means = {n: _BatchMeans.joined([p._means[n] for p in parts]) for n in one._means}
+        found._buffers, found._means = buffers, means
+        return found
+
     @property
     def names(self) -> tuple[str, ...]:
         return self._sums.names
@@ -248,7 +280,16 @@ class RunningChains:
 
     def with_model(self, model: Model) -> RunningChains:
         """The same for another compilation of the same net, independent of this one."""
-        return copy.deepcopy(self, {id(self._sums.model): model})
+        held = self._sums.model
+        found = copy.deepcopy(self, {} if held is None else {id(held): model})
+        found._sums.model = model
+        return found
+
+    def without_model(self) -> RunningChains:
+        """What can be saved of it: the same arrays, and no net."""
+        found = copy.copy(self)
+        found._sums = self._sums.without_model()
+        return found
 
     def _prepare(self, values: Mapping[str, np.ndarray]) -> None:
         """Decide from the first draw what is constant, and how many draws make a buffer."""
@@ -304,6 +345,16 @@ class _BatchMeans:
         self._length = 1
         self._sum: Any = 0.0
         self._count = 0
+
+    @staticmethod
+    def joined(parts: Sequence[_BatchMeans]) -> _BatchMeans:
+        """Those of other chains beside them."""
+        found = copy.copy(parts[0])
+        each = zip(*(part._kept for part in parts), strict=True)
+        found._kept = [np.concatenate(means) for means in each]
+        if found._count:
+            found._sum = np.concatenate([part._sum for part in parts])
+        return found
 
     def add(self, mean: np.ndarray) -> None:
         """Take in the mean of one more buffer, shape ``(chain, ...)``."""

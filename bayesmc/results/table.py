@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import UnknownNodeError
+from bayesmc.errors import MissingExtraError, UnknownNodeError
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,35 @@ class Summary:
     def to_dict(self) -> dict[str, dict[str, float]]:
         """Row name -> {column: figure}."""
         return {name: self[name] for name in self.names}
+
+    def to_dataframe(self) -> Any:
+        """As a pandas ``DataFrame``, a row for each name.
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError:
+            raise MissingExtraError(
+                "to_dataframe: pandas is not installed: pip install pandas"
+            ) from None
+        return pandas.DataFrame(self.columns, index=list(self.names))
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it."""
+        shown = range(len(self.names)) if len(self.names) <= 60 else [*range(30), *range(-30, 0)]
+        head = "".join(f"<th>{escape(c)}</th>" for c in ("", *self.columns))
+        rows = [
+            f"<tr><th>{escape(self.names[i])}</th>"
+            + "".join(f"<td>{_figure(v[i])}</td>" for v in self.columns.values())
+            + "</tr>"
+            for i in shown
+        ]
+        caption = f"<caption>{escape(self.title)}</caption>" if self.title else ""
+        return f"<table>{caption}<tr>{head}</tr>{''.join(rows)}</table>"
 
     def __str__(self) -> str:
         shown = list(range(len(self.names)))

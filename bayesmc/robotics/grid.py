@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.parameters import as_number as as_number  # handed on to the room
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.expression import as_one_call
 from bayesmc.shapes import first_index, read_only
@@ -246,14 +247,6 @@ def as_grid(call: str, grid: Any) -> OccupancyGrid:
             f"{found}"
         )
     return grid
-
-
-def as_number(value: Any) -> float:
-    """A single number as a float; NaN for anything else, text included."""
-    try:
-        return math.nan if isinstance(value, (str, bytes)) or np.ndim(value) else float(value)
-    except (TypeError, ValueError):
-        return math.nan
 
 
 # ---- private ------------------------------------------------------------------------------------

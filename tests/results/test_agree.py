@@ -132,7 +132,7 @@ def test_sums_are_the_draws_without_the_draws(answers):
     assert sums.log_marginal_likelihood == pytest.approx(draws.log_marginal_likelihood)
     assert sums.pareto_k == pytest.approx(draws.pareto_k, abs=0.02, nan_ok=True)
     for refused in (
-        lambda: sums.quantile("level", 0.5),
+        lambda: sums.quantile("x", 0.5),
         lambda: sums["level"],
         lambda: sums.resample(3),
         lambda: sums.expectation(lambda level: level),

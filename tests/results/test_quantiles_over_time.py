@@ -110,8 +110,8 @@ def test_levels_and_nodes_that_have_none_are_refused_in_words() -> None:
 
 @pytest.mark.parametrize(
     ("name", "says"),
-    [("ess", "weight_ess"), ("median", "quantile"), ("mode", "most_likely"), ("draws", "keep="),
-     ("innovations", "row_ranks"), ("density", "GridFilter"), ("nonsense", "has no 'nonsense'$")],
+    [("ess", "weight_ess"), ("interval", "hdi"), ("draws", "keep="),
+     ("density", "GridFilter"), ("nonsense", "has no 'nonsense'$")],
 )  # fmt: skip
 def test_what_has_another_name_is_named(name: str, says: str) -> None:
     dbn = bmc.DynamicBayesNet()

@@ -10,10 +10,13 @@ import numpy as np
 from bayesmc.engines.approximate.approximation import Approximation
 from bayesmc.engines.approximate.check import Check, checked
 from bayesmc.engines.approximate.stored import as_stored, completed
-from bayesmc.errors import UnknownNodeError
+from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results import DrawsPosterior, Marginal, Posterior
+from bayesmc.results.criteria import Elpd
+from bayesmc.results.laws import CurveLaws, Laws
+from bayesmc.results.over_time import expanded
 from bayesmc.results.posterior import quantile_levels, whole_draws
 from bayesmc.results.query import Query
 
@@ -86,6 +89,7 @@ class ApproximatePosterior(Posterior):
         """Covariance matrix of all scalars of the named nodes, in order; of one scalar, its variance."""
         if not names:
             raise UnknownNodeError("cov(): name at least one node")
+        names = tuple(expanded(self.model, names))
         for name in names:
             self._numeric(name, "cov")
         found = self.approximation.covariance(*names)
@@ -100,6 +104,18 @@ class ApproximatePosterior(Posterior):
             return self._drawn.quantile(name, q)
         shape = self.model[name].value_shape
         return np.array(found.ppf(levels.reshape(levels.shape + (1,) * len(shape))))
+
+    def _laws(self, name: str) -> Laws:
+        node = self._node(name)
+        found = None if node.domain is not None else self.approximation.marginal(name)
+        if found is None:
+            return super()._laws(name) if self._is_closed(name) else self._drawn._laws(name)
+
+        def ppf(levels: np.ndarray) -> np.ndarray:
+            shape = np.broadcast_shapes(levels.shape, node.value_shape)
+            return np.broadcast_to(found.ppf(levels), shape)
+
+        return CurveLaws(node.value_shape, ppf)
 
     def probabilities(self, *names: str) -> np.ndarray:
         if len(names) == 1:
@@ -131,6 +147,15 @@ class ApproximatePosterior(Posterior):
     ) -> Posterior:
         source = self._drawn if draws is None else self.resample(draws, rng)
         return source.predict(names, inputs, plates, rng)
+
+    def log_likelihood(self, *names: str) -> dict[str, np.ndarray]:
+        return self._drawn.log_likelihood(*names)
+
+    def loo(self, *names: str) -> Elpd:
+        return self._drawn.loo(*names)
+
+    def waic(self, *names: str) -> Elpd:
+        return self._drawn.waic(*names)
 
     def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
         return self._drawn.to_datatree(resample, rng)
@@ -228,6 +253,18 @@ class ApproximatePosterior(Posterior):
         node = self._node(name)
         labels = node.domain is not None and node.domain.labels is not None
         return (*node.value_shape, node.domain.size) if labels else node.value_shape  # type: ignore[union-attr]
+
+    def bind(self, problem: Problem) -> None:
+        """Not possible: what the approximation works out from functions is not in a file.
+
+        Raises
+        ------
+        UnsupportedError
+        """
+        raise UnsupportedError(
+            f"load(net=): an approximation by {type(self.engine).__name__} goes without its functions; load "
+            "it without net= (it answers from its moments and draws), or call infer again"
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions: draws are made before."""

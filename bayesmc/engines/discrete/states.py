@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem
+from bayesmc.dbn import UNCOMPARED, SeriesProblem
 from bayesmc.engines.discrete.limits import first_gap
 from bayesmc.engines.discrete.rows import Rows, Term, Variable
 from bayesmc.engines.discrete.run import Run
@@ -51,6 +51,8 @@ def rows_compared(problem: SeriesProblem, run: Run) -> Predictive | None:
 
     An exact filter answers without a seed, so that the draws are the same always.
     """
+    if problem.cache.get(UNCOMPARED):
+        return None
     static = {n: o.value for n, o in problem.series.static.items()}
     plan = SlicePlan(problem.slices, tuple(run.plan.reader.apart), static)
     looks = Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK), most=_MOST)

@@ -19,9 +19,12 @@ from bayesmc.network import Problem
 from bayesmc.network.forward import Compute, Pass, run
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results.draws import DrawsPosterior
+from bayesmc.results.laws import Laws, point_laws
 from bayesmc.results.marginal import Marginal, gaussian_marginal
-from bayesmc.results.posterior import Posterior, quantile_levels, table_variance, whole_draws
+from bayesmc.results.over_time import expanded
+from bayesmc.results.posterior import Posterior, quantile_levels, whole_draws
 from bayesmc.results.query import Query
+from bayesmc.results.statistics import table_quantile, table_variance
 from bayesmc.structure import known_values
 
 
@@ -94,6 +97,7 @@ class ExactPosterior(Posterior):
     def cov(self, *names: str) -> np.ndarray:
         if not names:
             raise UnknownNodeError("cov(): name at least one node")
+        names = tuple(expanded(self.model, names))
         nodes = [self._numeric(name, "cov") for name in names]
         if all(node.domain is not None for node in nodes):
             matrix = self._table_cov(names)
@@ -139,11 +143,19 @@ class ExactPosterior(Posterior):
             if seen is None:
                 raise self._cannot(f"quantile of {name!r}, which has no finite set of values")
             return np.broadcast_to(seen, levels.shape + seen.shape).copy()
-        numbers = np.asarray(node.domain.numbers)
-        order = np.argsort(numbers)
-        below = np.cumsum(self._tables.table(name)[..., order], axis=-1)
-        reach = below >= levels.reshape(levels.shape + (1,) * below.ndim) - 1e-12
-        return numbers[order][np.argmax(reach, axis=-1)]
+        return table_quantile(self._tables.table(name), np.asarray(node.domain.numbers), levels)
+
+    def _laws(self, name: str) -> Laws:
+        node = self._node(name)
+        if self._gaussian is not None and self._is_gaussian(name):
+            return self._gaussian.laws(name)
+        if node.domain is not None:
+            return super()._laws(name)
+        self._refuse_beyond(name, "hdi, mode, cdf and entropy")
+        seen = self._tables.known(name)
+        if seen is None:
+            raise self._cannot(f"hdi, mode, cdf and entropy of {name!r}")
+        return point_laws(seen, node.is_discrete)
 
     def _figures(self, name: str) -> dict[str, np.ndarray]:
         node = self.model[name]
@@ -277,6 +289,12 @@ class ExactPosterior(Posterior):
                 "to_datatree: an exact posterior has no draws; pass resample=draws"
             )
         return self.resample(resample, rng).to_datatree()
+
+    def bind(self, problem: Problem) -> None:
+        super().bind(problem)
+        self._tables.model = problem.model
+        if self._gaussian is not None:
+            self._gaussian.model = problem.model
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()

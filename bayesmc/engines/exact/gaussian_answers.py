@@ -17,6 +17,7 @@ from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors.moments import Components, Moments
 from bayesmc.gaussian import try_cholesky
 from bayesmc.network import Model, Observed
+from bayesmc.results.laws import Laws, NormalLaws, mixture_laws
 from bayesmc.structure import Variable, is_hidden
 
 #: below this a standard deviation is none: what is computed without noise
@@ -59,6 +60,24 @@ class GaussianAnswers:
         """Posterior variance, shape ``(*plates, *event)``."""
         parts = [np.diagonal(self._own(name, e)[1]) for e in self._elements(name)]
         return np.reshape(np.array(parts), self.model[name].value_shape)
+
+    def laws(self, name: str) -> Laws:
+        """The distribution of each number of a node by itself."""
+        node = self.model[name]
+        mean, std = self.mean(name), np.sqrt(np.maximum(self.var(name), 0.0))
+        everywhere = tuple(slice(None) for _ in node.plates)
+        parts = [self.distribution(name, (*everywhere, *at)) for at in np.ndindex(node.event_shape)]
+        if all(part.weights.shape[-1] == 1 for part in parts) or not np.any(std):
+            return NormalLaws(mean, std)
+        if not node.event_shape:
+            return mixture_laws(parts[0])
+        most = max(part.weights.shape[-1] for part in parts)
+        stacked = [
+            np.stack([_filled(take(part), most) for part in parts], axis=-2)
+            for take in (_weights_of, _locs_of, _scales_of)
+        ]
+        weights, locs, scales = (a.reshape(*node.value_shape, most) for a in stacked)
+        return mixture_laws(Mixture(weights, Normal(locs, np.where(scales > 0, scales, 1.0))))
 
     def components(
         self,
@@ -202,3 +221,20 @@ def _is_singular(covs: np.ndarray) -> bool:
     tril, bad = try_cholesky(covs)
     pivots = np.linalg.diagonal(tril) ** 2
     return bad is not None or bool((pivots <= _ROUNDING * np.linalg.diagonal(covs)).any())
+
+
+def _weights_of(mixture: Mixture) -> np.ndarray:
+    return mixture.weights
+
+
+def _locs_of(mixture: Mixture) -> np.ndarray:
+    return np.broadcast_to(mixture.components.loc, mixture.weights.shape)
+
+
+def _scales_of(mixture: Mixture) -> np.ndarray:
+    return np.broadcast_to(mixture.components.scale, mixture.weights.shape)
+
+
+def _filled(values: np.ndarray, most: int) -> np.ndarray:
+    """With zeros up to so many components."""
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, most - values.shape[-1])])

@@ -19,6 +19,7 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.laws import Laws, NormalLaws
 
 
 class GaussianSeries(SeriesPosterior):
@@ -73,6 +74,11 @@ class GaussianSeries(SeriesPosterior):
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``; those of angles about the mean."""
         return quantiles(self.mean(name), self.std(name), q, name)
+
+    def _laws(self, name: str) -> Laws:
+        if name in self._tables:
+            return super()._laws(name)
+        return NormalLaws(self.mean(name), self.std(name))
 
     @property
     def nis(self) -> np.ndarray:

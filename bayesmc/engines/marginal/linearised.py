@@ -15,12 +15,20 @@ Probabilistic Robotics, sec. 13.3 (FastSLAM's landmarks).
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS
-from bayesmc.distributions import MvNormal, Normal, VonMises, WrappedNormal
+from bayesmc.distributions import (
+    Distribution,
+    Joint,
+    MvNormal,
+    Normal,
+    VonMises,
+    WrappedNormal,
+)
 from bayesmc.engines.kalman.levels import Followed, Level, Part, Plan
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout, put_noise
@@ -34,6 +42,7 @@ from bayesmc.network.expressions import Opaque, density
 _STEP = float(np.finfo(float).eps ** (1 / 3))
 #: families whose location may be bent, and those of angles, which may be seen only
 _FAMILIES, _CIRCULAR = (Normal, MvNormal), (VonMises, WrappedNormal)
+_NOT_NORMAL = "depends on what is integrated out and is not Normal or MvNormal"
 
 
 def why_not_bent(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> str | None:
@@ -55,17 +64,32 @@ def why_not_bent(layout: Layout, name: str, values: Mapping[str, np.ndarray]) ->
         return f"cannot be followed ({found.reason})"
     result, above = found.result, hidden & found.leaves
     if node.is_stochastic and above:
-        if not isinstance(result, Family) or result.make not in (*_FAMILIES, *_CIRCULAR):
-            return "depends on what is integrated out and is not Normal or MvNormal"
-        for key, value in result.parameters.items():
-            bent = set().union(*(e.leaves for e in expressions_of(value))) & hidden
-            if key != "loc" and bent:
-                return f"has a {key} that depends on {', '.join(map(repr, sorted(bent)))}"
+        why = _why_no_place(result, hidden)
+        if why is not None:
+            return why
     try:
         if not Followed(model, [name], sorted(above), known).has_slopes:
             return "has no derivative that is known"
     except TraceError as error:
         return f"cannot be followed ({error})"
+    return None
+
+
+def _why_no_place(result: Any, hidden: Collection[str]) -> str | None:
+    """Why a distribution cannot be normal around a mean that moves with what is hidden, or None."""
+    if not isinstance(result, Family):
+        return None if isinstance(result, Distribution) else _NOT_NORMAL
+    if isinstance(result.make, type) and issubclass(result.make, Joint):
+        parts = [p for p in result.parameters.values() if isinstance(p, (Family, Distribution))]
+        if len(parts) < len(result.parameters):
+            return _NOT_NORMAL
+        return next((why for p in parts if (why := _why_no_place(p, hidden))), None)
+    if result.make not in (*_FAMILIES, *_CIRCULAR):
+        return _NOT_NORMAL
+    for key, value in result.parameters.items():
+        bent = set().union(*(e.leaves for e in expressions_of(value))) & set(hidden)
+        if key != "loc" and bent:
+            return f"has a {key} that depends on {', '.join(map(repr, sorted(bent)))}"
     return None
 
 

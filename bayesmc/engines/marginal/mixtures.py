@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from bayesmc.distributions import Mixture, Normal
+from bayesmc.engines.marginal.elements.beliefs import ElementBeliefs
 from bayesmc.engines.marginal.gaussians import Gaussians
 from bayesmc.network import CompiledNode
 
@@ -16,7 +17,7 @@ _POINT = 1e-13
 
 
 def mixture_quantiles(
-    inner: Gaussians, node: CompiledNode, weights: np.ndarray, levels: np.ndarray
+    inner: Gaussians | ElementBeliefs, node: CompiledNode, weights: np.ndarray, levels: np.ndarray
 ) -> np.ndarray:
     """Quantiles of a node, shape ``(*levels.shape, *plates, *event)``.
 
@@ -30,16 +31,18 @@ def mixture_quantiles(
     weights, mean, scale = (np.moveaxis(a, 0, -1) for a in (weights, mean, scale))
     mixture = Mixture(weights / weights.sum(axis=-1, keepdims=True), Normal(mean, scale))
     found = np.stack([mixture.ppf(level) for level in levels.reshape(-1)])
-    return found.reshape(*levels.shape, *found.shape[1:])
+    return found.reshape((*levels.shape, *found.shape[1:]))
 
 
 def covariance_within(
-    inner: Gaussians, nodes: Sequence[CompiledNode], shares: np.ndarray
+    inner: Gaussians | ElementBeliefs, nodes: Sequence[CompiledNode], shares: np.ndarray
 ) -> np.ndarray:
     """Mean of the particles' covariances of nodes one after the other; 0 for what they know.
 
     ``shares`` are normalised weights, shape ``(particles,)``.
     """
+    if isinstance(inner, ElementBeliefs):
+        return inner.covariance(nodes, shares)
     layout = inner.layout
     elements = math.prod(layout.lead)
     rows = inner.factors.reshape(-1, elements, *inner.factors.shape[-2:])

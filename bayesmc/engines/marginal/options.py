@@ -11,12 +11,16 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked
 from bayesmc.engines.marginal.choices import MOST
+from bayesmc.engines.marginal.elements.filter import ElementStep
+from bayesmc.engines.marginal.elements.guides import why_not_guided
+from bayesmc.engines.marginal.elements.plan import ElementPlan, element_plan
 from bayesmc.engines.marginal.smoothing import why_not_backwards
 from bayesmc.engines.marginal.split import AUTO, Split, blocks_of, split_of
+from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.marginal.tables.step import refuse_seen_in_part
 from bayesmc.engines.marginal.tables.telling import tables_told
 from bayesmc.engines.particles.layers import endless
-from bayesmc.engines.slice_steps import SliceProposals, plates_apart
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import UnsupportedError
 
 _SEEN = "observed, weights the particles by its predictive density"
@@ -28,6 +32,79 @@ FEW = 8.0
 PAST = ("smooth", "fixed-lag")
 #: options that do not go with it
 _ALONE = ("adapt", "recovery", "rejuvenation", "auxiliary")
+
+
+def marginal_step(
+    engine: Any,
+    split: Split,
+    slices: Slices,
+    static: Mapping[str, np.ndarray],
+    scheme: Any,
+    threshold: float,
+    kept: Any,
+    asked: SliceProposals | None,
+) -> MarginalStep:
+    """The step of a filter that integrates out: by element where elements are proven independent."""
+    plan = SlicePlan(slices, plates_apart(slices), static)
+    given = plan, split, engine.particles, scheme, threshold, kept, asked
+    elements = elements_of(slices, split, asked)
+    if elements is None:
+        return MarginalStep(*given)
+    guided = None
+    if asked is None:
+        guided, is_wrong = guided_node(slices, split, elements)
+        if is_wrong:
+            return MarginalStep(*given)
+    return ElementStep(*given, elements, guided)
+
+
+def elements_of(slices: Slices, split: Split, asked: SliceProposals | None) -> ElementPlan | None:
+    """What is integrated out element by element, where that pays; else None."""
+    if not split.inner:
+        return None
+    proposed = () if asked is None else [n for p in (*asked.first, *asked.later) for n in p.names]
+    key = (split, tuple(proposed))
+    kept = slices.later.cache.setdefault("elements", {})
+    if key not in kept:
+        found = element_plan(
+            slices, split.inner, split.seen, split.linearised, plates_apart(slices), proposed
+        )
+        pays = found is not None and (found.is_picked or found.still or bool(split.linearised))
+        kept[key] = found if pays else None
+    return kept[key]
+
+
+def elements_asked(engine: Any, slices: Slices, split: Split) -> ElementPlan | None:
+    """What this engine integrates out element by element, if anything."""
+    asked = None if engine.proposal == "optimal" else engine._proposals(slices)
+    elements = elements_of(slices, split, asked)
+    if elements is not None and asked is None and guided_node(slices, split, elements)[1]:
+        return None
+    return elements
+
+
+def drawn_by_element(
+    engine: Any, slices: Slices, split: Split, elements: ElementPlan, name: str, plain: str
+) -> str:
+    """What is done to a sampled node beside elements."""
+    if name in elements.pickers:
+        return "sampled given what it picks and the reading"
+    if engine.proposal == "optimal" and guided_node(slices, split, elements)[0] == name:
+        return "sampled given the slice before and the row, made linear in it"
+    return plain
+
+
+def guided_node(slices: Slices, split: Split, elements: ElementPlan) -> tuple[str | None, bool]:
+    """The sampled vector that is drawn with a look at readings of elements, and whether that cannot be.
+
+    Finite nodes that pick are drawn so anyhow; others are not, by element.
+    """
+    free = [n for n in slices.stochastic if n not in split.seen and n not in split.waiting]
+    free = [n for n in free if n not in elements.pickers]
+    if any(slices.later[n].domain is not None for n in free):
+        return None, True
+    fits = [n for n in free if why_not_guided(slices, elements, n) is None]
+    return (fits[0], False) if len(fits) == 1 else (None, bool(free))
 
 
 def read_marginalize(engine: Any) -> Any:
@@ -127,6 +204,9 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     slices = problem.slices
     sampled = [n for n in slices.stochastic if n not in problem.seen and n not in split.waiting]
     if engine.proposal == "optimal":
+        elements = elements_of(slices, split, None)
+        if elements is not None and not guided_node(slices, split, elements)[1]:
+            return None
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:
             return (
@@ -228,6 +308,11 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
     each = "a Kalman filter for each particle"
     if engine.proposal != "optimal" and not plates_apart(slices) and blocks_of(slices, split):
         each += f" and element of {' and '.join(map(repr, blocks_of(slices, split)))}"
+    elements = elements_asked(engine, slices, split)
+    if elements is not None:
+        lead = " and ".join(map(repr, elements.plates))
+        how = "where it is read" if elements.still else "all of which move"
+        each = f"a Kalman filter for each particle and element of {lead}, {how}"
     for name in slices.dynamic:
         if name in split.inner:
             found[name] = f"integrated out, {each}"
@@ -237,7 +322,9 @@ def told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dic
             found[name] = _SEEN
         else:
             drawn = name in slices.stochastic and name not in problem.seen
-            if drawn and engine.proposal == "optimal":
+            if drawn and elements is not None:
+                found[name] = drawn_by_element(engine, slices, split, elements, name, found[name])
+            elif drawn and engine.proposal == "optimal":
                 found[name] = "sampled given the slice before and the row"
             if name in split.why:
                 found[name] += f"; not integrated out: {split.why[name]}"

@@ -142,7 +142,7 @@ class MarginalStep(FilterStep):
             log = log if place.choices is not None else log + more
         found = self.weighted(row, values, log, selection)
         if not has_weight(found):
-            raise _degenerate(selection.particles, row)
+            raise degenerate(selection.particles, row)
         values |= inner.completed(rng)
         if self.tables is not None:
             values |= self.completed(row, known, values, (tables, after, moves), rng)
@@ -353,10 +353,8 @@ def seen_of(layout: Layout, row: Row) -> tuple[Pattern, np.ndarray, np.ndarray |
     return pattern, np.concatenate([target, more], axis=-1), given
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _degenerate(particles: int, row: Row) -> DegeneracyError:
+def degenerate(particles: int, row: Row) -> DegeneracyError:
+    """No particle explains a row."""
     return DegeneracyError(
         f"none of {particles} particles explains what was seen in slice {row.t}: every weight is zero; use "
         'more particles, proposal="optimal", a proposal= that looks at the observations, or less narrow '

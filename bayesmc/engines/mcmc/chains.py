@@ -14,26 +14,33 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.engines.base import Engine
-from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
+from bayesmc.engines.base import Engine, kept_names
+from bayesmc.engines.mcmc.convergence import (
+    poor_acceptance,
+    poor_mixing,
+    share_reached,
+    warn_of_ties,
+)
 from bayesmc.engines.mcmc.given import frozen_start, read_start
+from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_groups, state_of
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
-from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
+from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
+from bayesmc.engines.mcmc.patience import Patience
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.saved import SavedChains, answer_so_far
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
 from bayesmc.errors import (
     ConvergenceWarning,
     InterruptWarning,
-    ReducibleWarning,
     UnsupportedError,
 )
 from bayesmc.network import Problem
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunningChains
+from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunFile, RunningChains
 
 #: share of accepted proposals outside of which a random walk is ill adapted
 _BAND = (0.1, 0.9)
@@ -58,6 +65,9 @@ class ChainEngine(Engine):
         Effective size of every number of the answer that is asked for where ``draws`` is None.
     start : dict or None
         Node -> where its chains start.
+    groups : int or None
+        Equal groups of chains that run apart, units of work for an ``executor``; None: where a sweep is
+        mostly arithmetic, and one elsewhere.
     """
 
     draws: int | None
@@ -66,10 +76,15 @@ class ChainEngine(Engine):
     thinning: int = 1
     ess: float = _ESS
     start: Mapping[str, Any] | None = None
+    groups: int | None = None
+    spreads: ClassVar[bool] = True
+    #: whether what is worth a warning is left to whoever puts groups together
+    silent: ClassVar[bool] = False
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
     #: whether its kernels learn in few sweeps, so that a warmup may end as soon as starts are forgotten
     judges: ClassVar[bool] = False
+    saves: ClassVar[bool] = True
     #: whether each chain may be an array of members itself, so that more chains are not for free
     ensembles: ClassVar[bool] = False
 
@@ -88,6 +103,8 @@ class ChainEngine(Engine):
             raise ValueError(f"{name}(draws={self.draws}, ess={self.ess:g}): give one of both")
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(name, self.start))
+        if self.groups is not None:
+            check_groups(self)
 
     def __repr__(self) -> str:
         """What was said, and the effective size where that says how many draws there are."""
@@ -123,10 +140,13 @@ class ChainEngine(Engine):
         if self.draws is not None:
             chains = LEAST if self.chains is None else self.chains
             return Lengths(chains, WARMUP if self.warmup is None else self.warmup, self.draws)
-        kept: Sequence[str] | None = keep
-        if isinstance(keep, str):
-            nodes = problem.model.nodes.items()
-            kept = [n for n, c in nodes if c.kind != "input"] if keep == "draws" else None
+        names, summed, spilled = kept_names(keep, problem)
+        if spilled:
+            raise UnsupportedError(
+                f"{type(self).__name__}: keep={keep!r} leaves draws in the file, and with draws=None their "
+                "number follows from them; give draws="
+            )
+        kept = None if summed else names
         return chosen(
             problem,
             self.warmup,
@@ -148,35 +168,44 @@ class ChainEngine(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        executor: Any = None,
+        checkpoint: RunFile | None = None,
     ) -> Posterior:
-        listed, summed = not isinstance(keep, str), isinstance(keep, str) and keep == "summaries"
-        free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
-        names = tuple(keep) if listed else tuple(free)
+        many = self.draws is not None and (self.chains or LEAST) >= 2 * LEAST
+        if self.groups is not None or (many and checkpoint is None):
+            groups = groups_of(self, problem)
+            if groups > 1 and checkpoint is not None:
+                raise UnsupportedError(
+                    f"{type(self).__name__}(groups={groups}): runs in groups are not saved; leave "
+                    "checkpoint= or groups= away"
+                )
+            if groups > 1:
+                return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
+        return self._together(problem, seed, keep, progress, resume, checkpoint)
+
+    def _together(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any,
+        progress: bool | None,
+        resume: Posterior | None,
+        checkpoint: RunFile | None = None,
+    ) -> Posterior:
+        """All chains in one array."""
+        names, summed, spilled = kept_names(keep, problem)
         asked = lengths = self.lengths(problem, keep)
         if resume is not None:
             lengths = self._refuse_another(resume, problem, names, summed, lengths)
-        ready = replace(  # type: ignore[type-var]
-            self,
-            draws=lengths.draws,
-            warmup=None if lengths.judge else lengths.warmup,
-            chains=lengths.chains,
-            **({} if self.ess == _ESS else {"ess": _ESS}),
-        )
-        sampler = ready.sampler(problem)
-        if self.start and resume is None:
-            given = read_start(type(self).__name__, problem, self.start, lengths.chains)
-            sampler.given = given  # type: ignore[attr-defined]
-        if lengths.superchains:
-            sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
-        for kernel in getattr(sampler, "kernels", ()):
-            kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
-        tied = self.tied(problem)
-        if tied:
-            _warn_of_ties(type(self).__name__, tied)
+        sampler = self._ready(problem, asked, lengths, resume is None)
+        saving = None
+        if checkpoint is not None:
+            saving = SavedChains(checkpoint, problem, names, spilled)
         try:
-            held = self._held(problem, sampler, names, summed, resume, lengths)
+            held = self._held(problem, sampler, names, summed, resume, lengths, saving)
             rng = stream(seed, Purpose.INFER)
             loop = Loop(sampler, rng, problem, lengths, self.thinning)
+            loop.saving = saving
             sweeps = lengths.draws * self.thinning + (lengths.warmup if resume is None else 0)
             with Progress(sweeps, self.label, progress) as bar, Patience() as stop:
                 state = loop.begun(bar, resume, stop)
@@ -190,13 +219,78 @@ class ChainEngine(Engine):
                 finished = self._drawn(loop, state, held, bar, stop, reached)
         except MemoryError as error:
             raise no_memory(self, lengths.draws * lengths.chains, names) from error
+        if spilled and isinstance(held, Kept) and saving is not None:
+            if not finished:  # draws are in the file, which is gone on with by the same call
+                raise KeyboardInterrupt
+            held.put(saving.stand_ins(lengths.chains, held.draws))
         posterior = self._posterior(problem, sampler, held, loop)
         diverged = loop.divergences(posterior._chains_and_draws[1])
         if diverged is not None:
             before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
             posterior.divergences = diverged if before is None else np.hstack([before, diverged])
-        self._warn(posterior, sampler, finished, lengths)
+        if checkpoint is not None and saving is not None and finished:
+            lazily = saving.lazily(lengths.chains, held.draws) if spilled else None
+            checkpoint.finish(posterior, lazily)
+        if not self.silent:
+            self._warn(posterior, sampler, finished, lengths)
         return posterior
+
+    def _in_groups(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any,
+        progress: bool | None,
+        resume: Posterior | None,
+        executor: Any,
+        groups: int,
+    ) -> Posterior:
+        """The same by groups of chains that run apart."""
+        lengths = self.lengths(problem, keep)
+        if resume is not None:
+            summed = isinstance(resume, ChainsSums)
+            kept = resume._running.names if summed else tuple(resume._stored)  # type: ignore[attr-defined]
+            names = kept if isinstance(keep, str) else tuple(keep)
+            lengths = self._refuse_another(resume, problem, names, summed, lengths)
+        ready = replace(self, warmup=lengths.warmup, chains=lengths.chains)  # type: ignore[type-var]
+        tied = self.tied(problem)
+        if tied:
+            warn_of_ties(type(self).__name__, tied)
+        posterior, finished = run_groups(
+            ready, problem, seed, keep, progress, resume, executor, groups
+        )
+        sampler = replace(ready, chains=lengths.chains // groups, groups=1).sampler(problem)  # type: ignore[type-var]
+        object.__setattr__(posterior, "engine", self)
+        self._warn(posterior, sampler, finished, lengths)
+        if not finished:
+            posterior.checkpoint = None
+        return posterior
+
+    def _ready(self, problem: Problem, asked: Lengths, lengths: Lengths, is_new: bool) -> Sampler:
+        """The sampler of a run, told how long that is and where chains start."""
+        ready = replace(  # type: ignore[type-var]
+            self,
+            draws=lengths.draws,
+            warmup=None if lengths.judge else lengths.warmup,
+            chains=lengths.chains,
+            **({} if self.ess == _ESS else {"ess": _ESS}),
+        )
+        sampler = ready.sampler(problem)
+        if self.start and is_new:
+            given = read_start(type(self).__name__, problem, self.start, lengths.chains)
+            sampler.given = given  # type: ignore[attr-defined]
+        if lengths.superchains:
+            sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
+        for kernel in getattr(sampler, "kernels", ()):
+            kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
+        tied = self.tied(problem)
+        if tied and not self.silent:
+            warn_of_ties(type(self).__name__, tied)
+        return sampler
+
+    def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
+        """What a run has come to that has not ended; None where that is nothing."""
+        return answer_so_far(self, problem, file)
 
     def _drawn(
         self,
@@ -210,13 +304,16 @@ class ChainEngine(Engine):
         """Draws made, until they are enough where it is an effective size that is asked for."""
         lengths = loop.lengths
         before, draws, wanted = held.draws, lengths.first(), lengths.ess
-        if (
+        if loop.round is not None:  # where another process was
+            before, draws = 0, loop.round - held.draws
+        elif (
             wanted is not None and before
         ):  # what is there has its own, and as much again is asked for
             wanted += wanted * reached(wanted, agree=False)
         while True:
-            if isinstance(held, Kept) and held.draws > before:
-                held.more(draws)
+            if loop.round is not None and held.draws + draws > loop.round:
+                held.more(draws) if isinstance(held, Kept) else None
+            loop.round = held.draws + draws
             if not loop.draw(state, held, draws, bar, stop):
                 return False
             done = held.draws - before
@@ -241,8 +338,14 @@ class ChainEngine(Engine):
         summed: bool,
         resume: Posterior | None,
         lengths: Lengths,
+        saving: SavedChains | None,
     ) -> Kept | RunningChains:
         """Where draws go: new, or with those of an earlier run in it."""
+        if saving is not None and not summed:
+            return saving.held(lengths.chains, lengths.first())
+        if saving is not None and saving.state is not None and "sums" in saving.state:
+            sums: RunningChains = saving.state["sums"]
+            return sums.with_model(problem.model)
         if isinstance(resume, ChainsSums):
             return resume._running.with_model(problem.model)
         if summed:
@@ -254,11 +357,7 @@ class ChainEngine(Engine):
         return kept
 
     def _posterior(
-        self,
-        problem: Problem,
-        sampler: Sampler,
-        held: Kept | RunningChains,
-        loop: Loop,
+        self, problem: Problem, sampler: Sampler, held: Kept | RunningChains, loop: Loop
     ) -> ChainsPosterior | ChainsSums:
         checkpoint, lengths, warmup = loop.last.noted(problem), loop.lengths, loop.warmup
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}
@@ -319,13 +418,14 @@ class ChainEngine(Engine):
         lengths: Lengths,
     ) -> None:
         name = type(self).__name__
+        point = {} if posterior.checkpoint is None else posterior.checkpoint.state
         if not finished:
             chains, draws = posterior._chains_and_draws
-            message = (
-                f"{name}: interrupted; the posterior has the {draws} draws of each of {chains} chains "
-                "made so far, and infer(..., resume=posterior) continues them"
-            )
-            warnings.warn(message, InterruptWarning, stacklevel=4)
+            more = "infer(..., resume=posterior) continues them"
+            more = "groups that were stopped cannot be continued" if GROUPS in point else more
+            made = f"the {draws} draws of each of {chains} chains made so far"
+            message = f"{name}: interrupted; the posterior has {made}, and {more}"
+            warnings.warn(message, InterruptWarning, stacklevel=5)
         forward = self._forward(sampler)
         found = poor_mixing(posterior, forward, lengths.ess)
         band = getattr(sampler, "acceptance_band", _BAND)
@@ -337,25 +437,11 @@ class ChainEngine(Engine):
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, forward)
         assert posterior.checkpoint is not None
-        state = posterior.checkpoint.state
         count = getattr(sampler, "divergences", None)
+        state = posterior.checkpoint.state
+        if GROUPS in state:
+            state = state_of(state)
         if count is not None and count(state) is not None:
             found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
-            warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
-    """Warn that zeros in tables may hold chains."""
-    shown = ", ".join(map(repr, names[:6]))
-    if len(names) > 6:
-        shown += f" and {len(names) - 6} more"
-    warnings.warn(
-        f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
-        "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
-        ReducibleWarning,
-        stacklevel=4,
-    )
+            warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=5)

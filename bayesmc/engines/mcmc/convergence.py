@@ -12,7 +12,8 @@ together over chains.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ import scipy.special
 
 from bayesmc import diagnostics
 from bayesmc.engines.mcmc.screening import Looked, looked_at, screened, spread
+from bayesmc.errors import ReducibleWarning
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results import ChainsPosterior, ChainsSums
 from bayesmc.results.relabelling import ordered, pivot_of, symmetries
@@ -124,6 +126,19 @@ def scalar_name(model: Model, name: str, index: tuple[int, ...]) -> str:
         for plate, size, i in zip(node.plates, node.plate_shape, index, strict=False)
     ]
     return f"{name}[{', '.join(map(str, [*labels, *index[len(labels) :]]))}]"
+
+
+def warn_of_ties(engine: str, names: Sequence[str]) -> None:
+    """Warn that zeros in tables may hold chains."""
+    shown = ", ".join(map(repr, names[:6]))
+    if len(names) > 6:
+        shown += f" and {len(names) - 6} more"
+    warnings.warn(
+        f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
+        "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
+        ReducibleWarning,
+        stacklevel=5,
+    )
 
 
 # ---- private ------------------------------------------------------------------------------------

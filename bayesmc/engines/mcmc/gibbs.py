@@ -90,6 +90,10 @@ class Gibbs(ChainEngine):
         Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
         these. What nothing observed depends on is drawn forward, wherever it starts.
+    groups : int, optional
+        Equal groups of chains that run apart, each with random numbers of its own: units of work for
+        ``infer(executor=)``. It belongs to the question, so that a seed gives the same draws whoever works.
+        By default one, and groups of four or more where a sweep is mostly arithmetic; it needs ``draws``.
 
     References
     ----------
@@ -117,6 +121,7 @@ class Gibbs(ChainEngine):
     threads: int = field(default=1, compare=False, repr=False)
     ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+    groups: int | None = None
 
     label: ClassVar[str] = "Gibbs sampling"
     judges: ClassVar[bool] = True

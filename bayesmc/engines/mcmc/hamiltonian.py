@@ -69,6 +69,8 @@ class HamiltonianMonteCarlo(ChainEngine):
         Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
         Node -> where its chains start, as for `Gibbs`.
+    groups : int, optional
+        Groups of chains that run apart, as for `Gibbs`.
 
     Notes
     -----
@@ -107,6 +109,7 @@ class HamiltonianMonteCarlo(ChainEngine):
     debug: bool = False
     ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+    groups: int | None = None
 
     label: ClassVar[str] = "Hamiltonian Monte Carlo"
     judges: ClassVar[bool] = True

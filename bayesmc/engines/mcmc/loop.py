@@ -7,16 +7,14 @@ from __future__ import annotations
 
 import copy
 import math
-import signal
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.mcmc.patience import Patience
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Progress
@@ -29,8 +27,10 @@ _HOPELESS = 500
 #: draws of each chain in the first round, at least, and how much longer a later round may make a run
 _ROUND, _GROWTH = 16, 3.0
 
-#: what a sampler moves: arrays, numbers and nested dicts of them, picklable
+#: what a sampler moves: arrays, numbers and nested dicts of them, which can be saved
 State = Mapping[str, Any]
+#: after a draw: the state, that of the random numbers, and the values of all nodes
+Point = tuple[State, Mapping[str, Any], Mapping[str, np.ndarray]]
 
 
 class Sampler(Protocol):
@@ -128,6 +128,39 @@ class Lengths:
         return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
 
 
+class Begun(NamedTuple):
+    """Where an earlier process was: the state, and in the warmup the window that is to be judged."""
+
+    state: State
+    warming: bool
+    window: Kept | None
+
+
+class Saving(Protocol):
+    """Saves a run as it goes on (``saved``)."""
+
+    @property
+    def is_due(self) -> bool:
+        """Whether it is time."""
+        ...
+
+    def begin(self, loop: Loop) -> Begun | None:
+        """Put a loop where the run was; None where nothing is saved yet."""
+        ...
+
+    def wants(self, held: Kept | RunningChains) -> bool:
+        """Whether draws are to be saved now."""
+        ...
+
+    def save_warmup(self, loop: Loop, state: State, window: Kept | None) -> None:
+        """Save a state of the warmup."""
+        ...
+
+    def save(self, loop: Loop, point: Point, held: Kept | RunningChains) -> None:
+        """Save the draws since the last time, and where the chains are."""
+        ...
+
+
 class Loop:
     """Sweeps of one run, and the last point that it can return to."""
 
@@ -153,6 +186,10 @@ class Loop:
         self.phase = ""
         #: trajectories of each chain that diverged, before the first draw and after each
         self.diverged: list[np.ndarray] = []
+        #: saves the run as it goes on, if it is to be saved
+        self.saving: Saving | None = None
+        #: draws of each chain at which the present round ends
+        self.round: int | None = None
 
     def begun(self, bar: Progress, resume: Posterior | None, stop: Patience) -> State:
         """The state from which draws are made: after the warmup, or where an earlier run ended."""
@@ -163,27 +200,36 @@ class Loop:
             self.rng.bit_generator.state = self.last.generator
             # a sampler may write into its state, and the earlier posterior stays as it is
             return copy.deepcopy(self.last.state)
+        saved = None if self.saving is None else self.saving.begin(self)
+        if saved is not None and not saved.warming:
+            return saved.state
         with marking_invalid(), np.errstate(all="ignore"):
-            try:
-                state = self.sampler.start(self.rng, self.lengths.chains)
-            except (DensityError, ParameterError) as error:
-                error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
-                raise
+            state = self._started() if saved is None else saved.state
+            window = None if saved is None else saved.window
             self.phase = " (warmup)"
             for end in self.lengths.ends():
-                state, window = self._warmed(state, end, bar, stop)
-                if window is not None and self.lengths.judge(window):  # type: ignore[misc]
+                if end < self.sweep:  # passed before this process
+                    continue
+                state, window = self._warmed(state, end, bar, stop, window)
+                if window is not None and self.lengths.judge(window.frozen()):  # type: ignore[misc]
                     break
+                window = None
             self.warmup = self.sweep
             self.sweep, self.phase = 0, ""
             return self.sampler.end_warmup(state)
 
+    def _started(self) -> State:
+        try:
+            return self.sampler.start(self.rng, self.lengths.chains)
+        except (DensityError, ParameterError) as error:
+            error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
+            raise
+
     def _warmed(
-        self, state: State, end: int, bar: Progress, stop: Patience
-    ) -> tuple[State, Mapping[str, np.ndarray] | None]:
+        self, state: State, end: int, bar: Progress, stop: Patience, window: Kept | None
+    ) -> tuple[State, Kept | None]:
         """The state after some more sweeps, and the second half of the warmup so far if it is judged."""
         judged = end < self.lengths.warmup
-        window: Kept | None = None
         while self.sweep < end:
             stop.check()
             state = self._stepped(state, True)
@@ -193,7 +239,9 @@ class Loop:
                 if window is None:
                     window = Kept(self.model, tuple(values), self.lengths.chains, end - end // 2)
                 window.add(values)
-        return state, None if window is None else window.frozen()
+            if self.saving is not None and self.saving.is_due:
+                self.saving.save_warmup(self, state, window)
+        return state, window
 
     def draw(
         self,
@@ -206,7 +254,7 @@ class Loop:
         """Make and keep draws; whether it was left to finish."""
         thinning, known, wanted = self.thinning, self.known, held.draws + draws
         counted = self._counting(state, held)
-        point: tuple[State, Mapping[str, Any], Mapping[str, np.ndarray]] | None = None
+        point: Point | None = None
         try:
             with marking_invalid(), np.errstate(all="ignore"):
                 for _ in range(draws):
@@ -221,16 +269,20 @@ class Loop:
                         values = {**known, **values}
                     held.add(values)
                     point = state, self.rng.bit_generator.state, values
+                    if self.saving is not None and self.saving.wants(held):
+                        self.saving.save(self, point, held)
         except KeyboardInterrupt:
             if not held.draws:
                 raise
         if point is not None:
             self.last = Checkpoint(*point, self.observed)
+            if self.saving is not None:
+                self.saving.save(self, point, held)
         return held.draws == wanted
 
     def divergences(self, draws: int) -> np.ndarray | None:
         """Whether trajectories diverged, shape (chain, draw), of so many draws; None where there are none."""
-        if not self.diverged:
+        if len(self.diverged) < 2:
             return None
         return np.asarray(np.diff(np.stack(self.diverged[: draws + 1], axis=1), axis=1) > 0)
 
@@ -284,6 +336,8 @@ class Kept:
         self._moving: list[tuple[str, np.ndarray]] = []
         self._together: list[tuple[list[str], np.ndarray]] = []
         self._earlier: Mapping[str, np.ndarray] = {}
+        #: draws that are no longer held here, since they are in a file
+        self.gone = 0
 
     def begin_with(self, stored: Mapping[str, np.ndarray], draws: int) -> None:
         """Put earlier draws before those that there is room for."""
@@ -301,7 +355,7 @@ class Kept:
         """Take in one draw of every chain."""
         if not self.stored:
             self._make_room(values)
-        at = self.draws
+        at = self.draws - self.gone
         for name, array in self._moving:
             array[:, at] = values[name]
         for names, rows in self._together:
@@ -311,7 +365,29 @@ class Kept:
             except ValueError:  # some of them come without chains this time
                 for array, value in zip(rows, row, strict=True):
                     array[:, at] = value
-        self.draws = at + 1
+        self.draws += 1
+
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another draw."""
+        return self.draws - self.gone == self.room
+
+    def since(self, first: int) -> dict[str, Any]:
+        """Draws from one on, as they are saved: single numbers of a type as one array."""
+        part = slice(first - self.gone, self.draws - self.gone)
+        moving = {name: array[:, part] for name, array in self._moving}
+        together = [(list(names), rows[..., part]) for names, rows in self._together]
+        grouped = {n for names, _ in self._together for n in names}
+        still = {n: a for n, a in self.stored.items() if n not in moving and n not in grouped}
+        return {"moving": moving, "together": together, "still": still}
+
+    def drop(self) -> None:
+        """Let go of all draws in place, which are saved."""
+        self.gone = self.draws
+
+    def put(self, stored: Mapping[str, np.ndarray]) -> None:
+        """Hold other arrays instead, of all draws."""
+        self.stored, self._moving, self._together = dict(stored), [], []
 
     def frozen(self) -> dict[str, np.ndarray]:
         """The draws in place, read-only."""
@@ -348,35 +424,3 @@ class Kept:
                 if array.shape[1:2] == (self.room,):
                     array[:, : self.draws] = self._earlier[name]
             self._earlier = {}
-
-
-class Patience(AbstractContextManager["Patience"]):
-    """Within it, Ctrl-C waits until it is asked for, so that it cannot cut a sweep; a second one does not.
-
-    Only Python's own handling is put off, which a program that handles the signal itself has replaced.
-    """
-
-    def __init__(self) -> None:
-        self._pressed = False
-        self._own: Callable[..., Any] | None = None
-
-    def check(self) -> None:
-        """Raise what was put off."""
-        if self._pressed:
-            raise KeyboardInterrupt
-
-    def __enter__(self) -> Patience:
-        main = threading.current_thread() is threading.main_thread()
-        if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._own = signal.default_int_handler
-            signal.signal(signal.SIGINT, self._note)
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._own is not None:
-            signal.signal(signal.SIGINT, self._own)
-
-    def _note(self, number: int, frame: Any) -> None:
-        if self._pressed:
-            raise KeyboardInterrupt
-        self._pressed = True

@@ -82,6 +82,8 @@ class MetropolisHastings(ChainEngine):
         Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
         these. What nothing observed depends on is drawn forward, wherever it starts.
+    groups : int, optional
+        Groups of chains that run apart, as for `Gibbs`.
 
     Raises
     ------
@@ -125,6 +127,7 @@ class MetropolisHastings(ChainEngine):
     thinning: int = 1
     ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+    groups: int | None = None
 
     label: ClassVar[str] = "Metropolis-Hastings"
     ensembles: ClassVar[bool] = True

@@ -17,6 +17,7 @@ from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.node import nodes_read
+from bayesmc.results.laws import DrawnLaws, Laws, SliceLaws, curve_between
 from bayesmc.results.posterior import quantile_levels
 from bayesmc.results.series import numbers_of_states
 
@@ -128,7 +129,33 @@ class Answers(NamedTuple):
             return np.asarray(inner.mean_of(node))
         return self._numbers(particles, node)
 
+    def laws(self, name: str) -> Laws:
+        """The distribution of every number of a node, slice by slice."""
+        node = self.model[name]
+        found: list[Laws] = []
+        for now in self.particles:
+            numbers, weights = self._placed(now, node)
+            if now.inner is not None and now.inner.has(name) or has_table(now, node):
+
+                def quantile(q: np.ndarray, now: Particles = now) -> np.ndarray:
+                    return self._quantiles(now, node, q)
+
+                found.append(curve_between(numbers.shape[1:], quantile))
+                continue
+            total = weights.sum(axis=0, keepdims=True)
+            found.append(DrawnLaws(numbers, weights / total, node.is_discrete))
+        return SliceLaws(found)
+
     def _quantiles(self, now: Particles, node: CompiledNode, levels: Any) -> np.ndarray:
+        numbers, weights = self._placed(now, node)
+        if has_table(now, node):
+            return table_quantiles(now.tables, node.name, numbers_of_states(node), weights, levels)
+        if now.inner is not None and now.inner.has(node.name):
+            return mixture_quantiles(now.inner, node, weights, levels)
+        return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
+
+    def _placed(self, now: Particles, node: CompiledNode) -> tuple[np.ndarray, np.ndarray]:
+        """A node's numbers in one slice, angles near their mean, and a weight for each."""
         layout, numbers = self.layout, self._numbers(now, node, "quantile")
         if node.angles is not None:  # an order needs a cut: opposite the mean
             mean = Block(layout, [now]).mean_and_variance(node)[0][0]
@@ -139,12 +166,7 @@ class Answers(NamedTuple):
         for axis, size in zip(at, layout.lead, strict=False):
             shape[1 + axis] = size
         weights = now.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
-        weights = np.broadcast_to(weights, numbers.shape)
-        if has_table(now, node):
-            return table_quantiles(now.tables, node.name, numbers_of_states(node), weights, levels)
-        if now.inner is not None and now.inner.has(node.name):
-            return mixture_quantiles(now.inner, node, weights, levels)
-        return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
+        return numbers, np.broadcast_to(weights, numbers.shape)
 
     def _covariance(self, now: Particles, names: tuple[str, ...]) -> np.ndarray:
         n = len(now.weights)

@@ -27,8 +27,10 @@ from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import LowEssWarning, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.randomness import Purpose, resumed, stream
-from bayesmc.results.posterior import table_variance
+from bayesmc.results.laws import Laws, TableLaws
+from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.series import no_joint_table, numbers_of_states
+from bayesmc.results.statistics import table_variance
 
 
 class ParticleBelief(OnlineBelief):
@@ -255,6 +257,10 @@ class ParticleBelief(OnlineBelief):
 
     # ---- private -------------------------------------------------------------------------------
 
+    @property
+    def _as_series(self) -> MarginalAnswers:
+        return _Cloud(self)
+
     @cached_property
     def _particles(self) -> Particles:
         if self.now is None:
@@ -290,6 +296,31 @@ class ParticleBelief(OnlineBelief):
                 f"particles of {name!r} are not kept; there are those of {list(now.values)}"
             )
         return self._step.slices.first[name]
+
+
+class _Cloud(MarginalAnswers):
+    """A belief as a series of one slice."""
+
+    def __init__(self, belief: ParticleBelief) -> None:
+        self.belief, self.model = belief, belief._step.slices.first
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        return self.belief.quantile(name, q)[None]
+
+    def _laws(self, name: str) -> Laws:
+        node = self.belief._node(name)
+        if node.domain is None:
+            return self.belief._answers.laws(name)
+        labels = node.domain.labels is not None
+        return TableLaws(
+            self.belief.probabilities(name)[None], None if labels else numbers_of_states(node), name
+        )
+
+    def _lead(self) -> int:
+        return 1
+
+    def _answer_shape(self, name: str) -> tuple[int, ...]:
+        return (1, *self.belief._node(name).value_shape)
 
 
 def bound(

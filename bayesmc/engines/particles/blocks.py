@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.network import CompiledNode
-from bayesmc.results.posterior import circular_variance
+from bayesmc.results.statistics import circular_variance
 
 #: numbers of all particles of slices that are looked at side by side: what costs is calling NumPy
 NUMBERS = 1 << 17
@@ -258,8 +258,11 @@ def alike(one: Particles, other: Particles) -> bool:
     """Whether two slices can stand side by side: laid out alike, and none drawn anew."""
     if len(one.weights) != len(other.weights) or one.rejuvenated is not False:
         return False
-    for name, own in one.values.items():
-        if own.ndim != other.values[name].ndim:
+    # without what is drawn once it is looked at
+    if dict.keys(one.values) != dict.keys(other.values):
+        return False
+    for name, own in dict.items(one.values):
+        if own.ndim != dict.__getitem__(other.values, name).ndim:
             return False
     return other.rejuvenated is False
 

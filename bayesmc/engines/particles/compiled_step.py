@@ -70,6 +70,11 @@ def compiled_step(step: FilterStep, steps: int, compiled: bool | None = None) ->
     return step
 
 
+def is_worth_compiling(particles: int, steps: int) -> bool:
+    """Whether so many slices take long enough for machine code to pay, whatever is loaded already."""
+    return steps * (_SLICE + _PARTICLE * particles) >= _WORTH
+
+
 def told(step: FilterStep, problem: SeriesProblem, compiled: bool | None = None) -> str:
     """What makes the slices of a series, and why nothing faster does; nothing where that is no question."""
     if compiled is None and (not is_available() or _is_short(step, problem.steps)):
@@ -195,7 +200,7 @@ def _why_not(step: FilterStep, steps: int, compiled: bool | None) -> str | None:
 
 
 def _is_short(step: FilterStep, steps: int) -> bool:
-    return steps * (_SLICE + _PARTICLE * step.layout.particles) < _WORTH
+    return not is_worth_compiling(step.layout.particles, steps)
 
 
 def _is_at_hand(step: FilterStep, steps: int) -> bool:

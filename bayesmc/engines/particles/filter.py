@@ -12,14 +12,8 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.marginal import options as marginal
-from bayesmc.engines.marginal.step import MarginalStep
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
-from bayesmc.engines.particles.belief import (
-    ParticleBelief,
-    absorbed,
-    bound,
-    warn_of_a_lonely_step,
-)
+from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound, warn_of_a_lonely_step
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_delay
 from bayesmc.engines.particles.enough import BUDGET, START, TOLERANCE, enough, price, warn_of_errors
@@ -45,15 +39,19 @@ from bayesmc.engines.particles.options import (
     warn_of_what_is_not_guided,
     without_functions,
 )
-from bayesmc.engines.particles.record import FilteredParticles, filtered_by
+from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
+from bayesmc.engines.particles.run import filtered_by
+from bayesmc.engines.particles.runs import run_of
 from bayesmc.engines.particles.smoothing import Backwards, backwards
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.resampling import Adaptive, checked, scheme_of
+from bayesmc.results import RunFile
 from bayesmc.results.predictive import warn_of_misfit
+from bayesmc.storage import Saver
 
 #: options that hold functions by node
 _FUNCTIONS = ("proposal", "initial_proposal", "rejuvenation")
@@ -277,6 +275,7 @@ class ParticleFilter(FilterEngine):
         keep: str | None = None,
         queries: Queries | None = None,
         progress: bool | None = None,
+        checkpoint: RunFile | None = None,
     ) -> FilteredParticles:
         if keep not in (None, "particles"):
             raise ValueError(
@@ -285,12 +284,8 @@ class ParticleFilter(FilterEngine):
         if not self._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
-            sized = self._sized(self._enough(problem, seed, keep is not None, progress))
             whole = keep is not None, queries or {}, progress
-            if self.delay is None:
-                found = filtered = sized._passed(problem, seed, *whole)
-            else:
-                found, filtered = by_lag(sized, problem, seed, self.delay, *whole, "filter")
+            found, filtered = run_of(self, problem, seed, *whole, checkpoint)
         except KeyboardInterrupt as stop:
             found = filtered = answer_so_far(stop, self)
         warn_of_errors(filtered, self, marginal.numbers_carried(self, problem))
@@ -350,8 +345,8 @@ class ParticleFilter(FilterEngine):
         if self.marginalize is not None:
             split = marginal.split_asked(self, slices, static, seen)
             if split is not None:
-                plan = SlicePlan(slices, apart, static)
-                return MarginalStep(plan, split, count, checked(scheme), threshold, kept, asked)
+                own = checked(scheme), threshold, kept, asked
+                return marginal.marginal_step(self, split, slices, static, *own)
         plan = (
             OptimalPlan(slices, apart, static)
             if is_optimal
@@ -398,14 +393,16 @@ class ParticleFilter(FilterEngine):
         queries: Queries,
         progress: bool | None,
         unit: int = 0,
+        saver: Saver | None = None,
     ) -> FilteredParticles:
         """All slices, one by one."""
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
         step = self.step_of(problem.slices, problem.known_static, kept, problem.seen)
         if not step.integrated:
-            step = compiled_step(step, problem.steps, self.compiled)
-        return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
+            compiled = self.compiled if saver is None else saver.state["compiled"]
+            step = compiled_step(step, problem.steps, compiled)
+        return filtered_by(self, step, problem, seed, keep, queries, progress, unit, saver=saver)
 
     def _integrates(self, problem: SeriesProblem) -> bool:
         """Whether anything is integrated out."""

@@ -56,6 +56,11 @@ class FilterStep(SMCStep):
     integrated: frozenset[str] = frozenset()
     #: how many slices back answers are wanted
     lag: int = 0
+    #: whether beliefs must be about all of a slice together, as what goes back over slices takes them
+    whole: bool = False
+    #: nodes of so many numbers that drawing them all costs more than all the rest: rows are not held against
+    #: some that are drawn then, and what is lost is told by the other nodes
+    too_wide: frozenset[str] = frozenset()
 
     def __init__(
         self,
@@ -70,7 +75,7 @@ class FilterStep(SMCStep):
         injection: Injection | None = None,
     ) -> None:
         slices, numbers = plan.slices, max(size_of(plan.slices), 1)
-        block = particles if particles * numbers <= WHOLE else max(1, BLOCK // numbers)
+        block = block_of(particles, numbers)
         lead = tuple(slices.first.sizes[p] for p in plan.apart)
         nodes = {n: slices.later[n] for n in slices.dynamic}
         super().__init__(
@@ -206,6 +211,11 @@ class FilterStep(SMCStep):
             row.t,
             node,
         )
+
+
+def block_of(particles: int, numbers: int) -> int:
+    """Particles that are passed at a time, where the largest node has so many numbers."""
+    return particles if particles * numbers <= WHOLE else max(1, BLOCK // numbers)
 
 
 def has_weight(particles: Particles) -> bool:

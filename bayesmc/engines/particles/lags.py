@@ -13,7 +13,8 @@ from bayesmc.engines.filtering import Queries
 from bayesmc.engines.particles.backward import lagged
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
-from bayesmc.engines.particles.record import FilteredParticles, Record, filtered_by
+from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.smc import Bare, Particles
 from bayesmc.randomness import Purpose, stream
 

@@ -153,6 +153,11 @@ class Ahead:
         self._before: Particles | None = None
         self._first, self._is_followed = 0, False
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether all slices that were made have been passed."""
+        return self._made is None
+
     def reaches(self, k: int, now: Particles | None, rng: np.random.Generator) -> bool:
         """Whether the k-th slice, which follows that of some particles, is made together with others."""
         if self._made is None:

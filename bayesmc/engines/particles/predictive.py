@@ -111,6 +111,28 @@ class Replicates:
         whole = Predictive(self._rows, self._deficits, self._ranks, self._broken)
         return whole if steps is None else whole.first(steps)
 
+    def rows(self, first: int, end: int) -> dict[str, Any]:
+        """What came of some slices, to be saved."""
+        part = slice(first, end)
+        ranks = {n: a[part] for n, a in self._ranks.items()}
+        return {"rows": self._rows[part], "deficits": self._deficits[part], "ranks": ranks}
+
+    def put(self, first: int, rows: Mapping[str, Any]) -> None:
+        """Take in what was saved of the slices from one on."""
+        part = slice(first, first + len(rows["rows"]))
+        self._rows[part], self._deficits[part] = rows["rows"], rows["deficits"]
+        for name, ranks in rows["ranks"].items():
+            self._ranks[name][part] = ranks
+
+    @property
+    def state(self) -> tuple[Any, ...]:
+        """All else that changes as slices pass."""
+        return self.rng.bit_generator.state, self._until, self._cannot, self._broken
+
+    def go_on(self, state: tuple[Any, ...]) -> None:
+        """Be where another one was."""
+        self.rng.bit_generator.state, self._until, self._cannot, self._broken = state
+
     # ---- private -------------------------------------------------------------------------------
 
     def _taken(self, before: Particles | Draws | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:

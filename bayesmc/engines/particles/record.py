@@ -1,4 +1,4 @@
-"""The run of a filter over a series, and what it keeps: answers of constant size, or the particles."""
+"""What the run of a filter over a series keeps: answers of constant size, or the particles."""
 
 from __future__ import annotations
 
@@ -13,30 +13,37 @@ from bayesmc.engines.filtering import (
     Queries,
     first_slices,
     observed_answers,
-    pass_slices,
     refuse_forecast,
 )
+from bayesmc.engines.particles.agreed import numbers_of, write_agreed
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.families import Families
-from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
-from bayesmc.engines.particles.made import Ahead, MadeSlices
-from bayesmc.engines.particles.predictive import Replicates
-from bayesmc.engines.particles.smc import Layout, Particles, quiet
+from bayesmc.engines.particles.made import MadeSlices
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.engines.particles.written import KINDS, Rows, Waiting, Written
+from bayesmc.engines.particles.written import (
+    KINDS,
+    Rows,
+    Waiting,
+    Written,
+    count,
+    joined,
+    last_rows,
+    together,
+)
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
-from bayesmc.progress import Progress
-from bayesmc.randomness import Purpose, stream
 from bayesmc.results.predictive import Predictive
 from bayesmc.results.series import SeriesPosterior, without_labels
 
 #: slices that are written together, at most, and those that are though half as many would stay in cache
 TOGETHER, FEW = 100, 6
+#: what waits to be written
+_UNSETTLED = ("_waiting", "_most", "_tallies", "_figures", "_summed")
 
 
 class Record:
@@ -121,7 +128,7 @@ class Record:
         if earlier and not self.keep:
             earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
             if len(earlier) - self._packed >= TOGETHER:  # many small arrays hold more than one
-                earlier = [*earlier[: self._packed], _packed(earlier[self._packed :])]
+                earlier = [*earlier[: self._packed], together(earlier[self._packed :])]
                 self._packed += 1
         self._written, self._waiting = [*earlier, worked_out], []
         self._tallies, self._figures, self._summed = [], [], []
@@ -169,6 +176,8 @@ class Record:
         rows: Rows = {what: {} for what in KINDS}
         for node in self._nodes:
             name = node.name
+            if write_agreed(rows, block, by, node):
+                continue
             if node.domain is not None:
                 rows["tables"][name] = block.table(node)
             else:
@@ -243,11 +252,33 @@ class Record:
         rows["query errors"] |= {name: held.mcse(f) for name, f in self.asked.items()}
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
+    # ---- what is saved of it ---------------------------------------------------------------------
+
+    def written_since(self, slices: int) -> list[Written]:
+        """What is written of the slices from one on, but for the last piece, which is ``unsettled``."""
+        found, first = [], 0
+        for piece in self._written[:-1]:
+            end = first + count(piece)
+            if end > slices:
+                found.append(last_rows(piece, max(slices - first, 0)))
+            first = end
+        return found
+
+    def unsettled(self) -> dict[str, Any]:
+        """All else, which is yet to change."""
+        return {name: getattr(self, name) for name in _UNSETTLED} | {"last": self._written[-1:]}
+
+    def go_on(self, written: Sequence[Written], unsettled: Mapping[str, Any]) -> None:
+        """Be where another record was."""
+        for name in _UNSETTLED:
+            setattr(self, name, unsettled[name])
+        self._written, self._packed = [*written, *unsettled["last"]], len(written)
+
     # ---- private -------------------------------------------------------------------------------
 
     def _together(self, particles: Particles) -> int:
         """Slices that are written together."""
-        numbers = sum(particles.values[n.name].size for n in self._nodes)
+        numbers = sum(numbers_of(particles, n) for n in self._nodes)
         many = NUMBERS // max(numbers, len(particles.weights))
         return min(TOGETHER, max(1, many // 2, min(FEW, many)))
 
@@ -260,7 +291,7 @@ class Record:
         return self.tracker.after(self.families, earlier, block, rows)
 
     def _joined(self, what: str, steps: int) -> dict[str, np.ndarray]:
-        return first_slices(_joined(self._written, what), steps)
+        return first_slices(joined(self._written, what), steps)
 
 
 class FilteredParticles(SeriesPosterior):
@@ -318,9 +349,7 @@ class FilteredParticles(SeriesPosterior):
 
     def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
         """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
-        if not callable(what):
-            return super().mcse(what)
-        return self._kept("mcse of a function").mcse(what)
+        return self._kept("mcse of a function").mcse(what) if callable(what) else super().mcse(what)
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
@@ -364,10 +393,12 @@ class FilteredParticles(SeriesPosterior):
         node = without_labels(self._node(name), "quantile")
         return self._kept("quantile").quantile(node.name, q)
 
+    def _held_laws(self, name: str) -> Any:
+        return self._kept("hdi, mode, cdf or entropy").laws(name)
+
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""
-        held = self._kept("cov")
-        return held.cov(*(self._node(name).name for name in names))
+        return self._kept("cov").cov(*(self._node(name).name for name in names))
 
     def _alike(self, what: str) -> Answers:
         """What is held, where each slice has as many particles."""
@@ -382,69 +413,3 @@ class FilteredParticles(SeriesPosterior):
         if self.held is None:
             raise self._not_kept(what)
         return self.held
-
-
-def filtered_by(
-    engine: Any,
-    step: FilterStep,
-    problem: SeriesProblem,
-    seed: np.random.SeedSequence,
-    keep: bool,
-    queries: Queries,
-    progress: bool | None,
-    unit: int = 0,
-    look_back: Callable[[int, Particles, Families], None] | None = None,
-    names: Sequence[str] | None = None,
-) -> FilteredParticles:
-    """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
-
-    Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows. There are
-    answers about some nodes, or all that are hidden.
-    """
-    record = Record(problem, step.layout, queries, keep, Tracker(step), names)
-    rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
-    looks = Replicates(problem, step.plan, check) if unit == 0 else None
-    now: Particles | None = None
-    is_ahead = step.machine is not None and look_back is None
-    ahead = Ahead(step.machine, problem, record) if is_ahead else None
-
-    def move(k: int) -> None:
-        nonlocal now
-        if ahead is not None and ahead.reaches(k, now, rng):
-            now = ahead.passed(k, looks)
-            return
-        row, old = problem.series.row(k), now
-        if looks is not None:
-            looks.look(k, old, row)
-        now = step(old, row, rng)
-        record.add(k, now, row)
-        if look_back is not None:
-            record.write()
-            assert record.families is not None
-            look_back(k, now, record.families)
-        if old is not None and not keep and look_back is None and record.is_written:
-            step.recycle(old)
-
-    def so_far(steps: int) -> FilteredParticles:
-        if ahead is not None:
-            ahead.stop(steps)
-        return record.posterior(engine, "filter", steps)
-
-    with Progress(problem.steps, engine.label, progress) as bar, quiet():
-        pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
-        return record.posterior(engine, predictive=None if looks is None else looks.found())
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
-    """Arrays of one kind, of all slices that are written."""
-    names = {n: None for w in written for n in w.rows[what]}
-    pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
-    return {n: np.concatenate(rows) for n, rows in pieces.items()}
-
-
-def _packed(written: Sequence[Written]) -> Written:
-    """Slices without their particles, as one."""
-    return Written({what: _joined(written, what) for what in KINDS}, [], [])

@@ -420,8 +420,10 @@ class _Spare:
         self._free: dict[tuple[Any, ...], list[np.ndarray]] = {}
 
     def get(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-        free = self._free.get((shape, dtype))
-        return free.pop() if free else np.empty(shape, dtype)
+        try:  # in one step, as other threads may use the same step
+            return self._free[shape, dtype].pop()
+        except (KeyError, IndexError):
+            return np.empty(shape, dtype)
 
     def put(self, *arrays: np.ndarray) -> None:
         for array in arrays:

@@ -12,7 +12,8 @@ from bayesmc.engines.filtering import Queries
 from bayesmc.engines.marginal.smoothing import MarginalBackward, why_not_backwards
 from bayesmc.engines.particles.backward import TRAJECTORIES, Backward
 from bayesmc.engines.particles.coalescence import Sharing
-from bayesmc.engines.particles.record import FilteredParticles, Record, filtered_by
+from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.smc import quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.randomness import Purpose, stream
@@ -35,6 +36,7 @@ def backwards(
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """Trajectories drawn backwards, and the filter's answer."""
     step = engine.step_of(problem.slices, problem.known_static, seen=problem.seen)
+    step.whole = True
     filtered = filtered_by(engine, step, problem, seed, True, {}, progress)
     assert filtered.held is not None
     count = asked.trajectories or min(step.layout.particles, TRAJECTORIES)

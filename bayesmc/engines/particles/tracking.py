@@ -68,7 +68,7 @@ class Tracker:
         self.room: dict[Any, np.ndarray] = {}
         self.layout = step.layout
         nodes = [step.slices.later[n] for n in step.slices.interface]
-        self.sight = Sight(nodes, step.layout)
+        self.sight = Sight([n for n in nodes if n.name not in step.too_wide], step.layout)
         finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
         self.scouting = step.scouting() if finite else None
         blind = step.is_guided or step.first_stage is not None or step.injection is not None

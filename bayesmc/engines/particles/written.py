@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,3 +33,28 @@ class Written(NamedTuple):
     rows: Rows
     families: list[Families]
     particles: list[Particles]
+
+
+def joined(written: Sequence[Written], what: str) -> dict[str, np.ndarray]:
+    """Arrays of one kind, of all slices that are written."""
+    names = {n: None for w in written for n in w.rows[what]}
+    pieces = {n: [w.rows[what][n] for w in written if n in w.rows[what]] for n in names}
+    return {n: np.concatenate(rows) for n, rows in pieces.items()}
+
+
+def together(written: Sequence[Written]) -> Written:
+    """Slices without their particles, as one."""
+    return Written({what: joined(written, what) for what in KINDS}, [], [])
+
+
+def count(written: Written) -> int:
+    """How many slices are written there."""
+    return len(written.rows["filter"]["increments"])
+
+
+def last_rows(written: Written, first: int) -> Written:
+    """The slices from one on; particles, where there are any, stay."""
+    if not first:
+        return written
+    rows = {what: {n: a[first:] for n, a in own.items()} for what, own in written.rows.items()}
+    return written._replace(rows=rows)

@@ -20,6 +20,7 @@ from bayesmc.errors import QueryError, UnsupportedError
 from bayesmc.network import CompiledNode, Observed
 from bayesmc.network.node import nodes_read
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.laws import Laws, mixture_laws
 from bayesmc.results.posterior import quantile_levels
 
 #: standard deviation that stands for none, relative to the number
@@ -155,10 +156,22 @@ class SwitchingSeries(SeriesPosterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``, of the mixtures over modes."""
-        node = self._node(name)
+        self._node(name)
         if name not in self.beliefs.layout.rows:
             return super().quantile(name, q)
         levels = quantile_levels(name, q)
+        mixture = self._mixture(name)
+        flat = np.stack([mixture.ppf(level) for level in levels.reshape(-1)], axis=1)
+        return flat.reshape(len(flat), *levels.shape, *flat.shape[2:])
+
+    def _laws(self, name: str) -> Laws:
+        if name not in self.beliefs.layout.rows:
+            return super()._laws(name)
+        return mixture_laws(self._mixture(name))
+
+    def _mixture(self, name: str) -> MixtureOf:
+        """The numbers of a node in every slice, time first, as mixtures over modes."""
+        node = self._node(name)
         found = self.beliefs
         place = found.layout.rows[name]
         mean, var = (
@@ -172,9 +185,7 @@ class SwitchingSeries(SeriesPosterior):
         )
         scale = np.sqrt(var)
         scale = np.maximum(scale, _POINT * (np.abs(mean) + 1e-300))
-        mixture = MixtureOf(weights, Normal(mean, scale))
-        flat = np.stack([mixture.ppf(level) for level in levels.reshape(-1)], axis=1)
-        return flat.reshape(len(flat), *levels.shape, *flat.shape[2:])
+        return MixtureOf(weights, Normal(mean, scale))
 
     def cov(self, *names: str) -> np.ndarray:
         """Joint covariances of nodes in every slice.

@@ -15,22 +15,35 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.categorical import log_sum_exp
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.base import Engine
-from bayesmc.engines.forward import chunk_sizes
+from bayesmc.engines.base import Engine, kept_names
+from bayesmc.engines.forward import chunk_count, chunk_sizes
 from bayesmc.engines.mcmc.question import difference
-from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.engines.weighted.saved import SavedDraws, drawn_so_far
+from bayesmc.errors import (
+    BudgetError,
+    InterruptWarning,
+    LowEssWarning,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import Pass, Step, run
-from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
+from bayesmc.results import DrawsPosterior, Posterior, RunFile, Sums, SumsPosterior
 from bayesmc.results.chains import noted_densities
+from bayesmc.workers import in_order
 
 #: share of the draws above which weights are even: they have a heavy tail only if the largest one counts
 _EVEN = 0.5
 #: share of the sum of squared weights from which one weight counts; of weights that are bounded every share
 #: falls as 1 / draws, while k is large wherever a rare state has a larger weight than the others
 _COUNTS = 0.004
+
+#: chunks in a unit of work, which are summed up together
+_CHUNKS = 8
+
+#: stored values of some nodes for some draws, their log weights, and how many they are
+Chunk = tuple[dict[str, np.ndarray], Any, int]
 
 #: draws at which the densities of a net that was declared anew are compared
 _COMPARED = 16
@@ -71,6 +84,9 @@ class WeightedEngine(Engine):
         """Whether draws of an ``other`` engine may be joined with this one's."""
         return type(other) is type(self)
 
+    saves: ClassVar[bool] = True
+    spreads: ClassVar[bool] = True
+
     def run(
         self,
         problem: Problem,
@@ -78,49 +94,92 @@ class WeightedEngine(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        executor: Any = None,
+        checkpoint: RunFile | None = None,
     ) -> Posterior:
-        names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
-        steps, known = self.steps(problem), self.known(problem)
-        with Progress(self.draws, self.label, progress) as bar:
-            first = resume.streams if isinstance(resume, DrawsPosterior) else 0
-            sizes = _sizes(problem.model, self.draws)
-            chunks = _counted(passes(steps, sizes, seed, known, first), bar)
-            if isinstance(keep, str) and keep == "summaries":
-                if resume is not None:
-                    raise UnsupportedError('infer: resume= continues draws; give keep="draws"')
-                return self._summaries(problem, chunks, names)
-            kept = names if isinstance(keep, str) else tuple(keep)
-            try:
-                return self._draws(problem, chunks, kept, resume)
-            except MemoryError as error:
-                raise no_memory(self, self.draws, kept) from error
+        names, summed, spilled = kept_names(keep, problem)
+        first = resume.streams if isinstance(resume, DrawsPosterior) else 0
+        if summed and resume is not None:
+            raise UnsupportedError('infer: resume= continues draws; give keep="draws"')
+        saving = None if checkpoint is None else SavedDraws(checkpoint, problem, names, spilled)
+        done = 0 if saving is None else saving.chunks
+        shared = {
+            "engine": self, "problem": problem, "seed": seed, "names": names, "summed": summed,
+        }  # fmt: skip
+        parts = in_order(
+            _unit_drawn, shared, _units(problem.model, self.draws, first, done), executor,
+            label=self.label, total=-(-(chunk_count(problem.model, self.draws) - done) // _CHUNKS),
+            progress=progress,
+        )  # fmt: skip
+        try:
+            if summed:
+                found: Posterior = self._summaries(problem, parts, names, saving)
+            elif saving is not None and spilled:
+                return self._spilled(problem, parts, saving)
+            else:
+                found = self._draws(problem, parts, names, resume, saving)
+        except MemoryError as error:
+            raise no_memory(self, self.draws, names) from error
+        if checkpoint is not None:
+            checkpoint.finish(found)
+        return found
+
+    def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
+        """What a run has come to that has not ended; None where that is nothing."""
+        return drawn_so_far(self, problem, file)
 
     def _summaries(
-        self, problem: Problem, chunks: Iterable[Pass], names: tuple[str, ...]
+        self,
+        problem: Problem,
+        parts: Iterator[Sums],
+        names: tuple[str, ...],
+        saving: SavedDraws | None,
     ) -> SumsPosterior:
         sums = Sums(problem.model, names)
-        for chunk in chunks:
-            sums.add(chunk.values, chunk.log_weight, chunk.batch[0])
-        self._refuse_zero(sums.top, self.draws)
+        if saving is not None and saving.count:
+            sums = saving.sums()
+        try:
+            for part in parts:
+                sums.merge(part)
+                if saving is not None:
+                    saving.passed(sums, _CHUNKS)
+        except KeyboardInterrupt:
+            self._interrupted(0 if saving is not None else sums.draws)
+        self._refuse_zero(sums.top, sums.draws)
         weighted = self.is_weighted(problem)
         posterior = SumsPosterior(problem, self, sums, weighted)
         log_total = sums.top + float(np.log(sums.weight[0]))
-        self._set_evidence(posterior, log_total, self.draws, weighted, sums.tail.values())
+        self._set_evidence(posterior, log_total, sums.draws, weighted, sums.tail.values())
         return posterior
 
     def _draws(
         self,
         problem: Problem,
-        chunks: Iterable[Pass],
+        parts: Iterator[list[Chunk]],
         names: Sequence[str],
         resume: Posterior | None,
+        saving: SavedDraws | None,
     ) -> DrawsPosterior:
         kept = Kept(problem.model, names, self.draws)
         log_weights = np.zeros((1, self.draws))
-        for chunk in chunks:
-            log_weights[0, kept.count : kept.count + chunk.batch[0]] = chunk.log_weight
-            kept.add(chunk.values, chunk.batch[0])
-        stored = kept.stored
+        if saving is not None:
+            for values, logs, count in saving.earlier():
+                log_weights[0, kept.count : kept.count + count] = logs
+                kept.add(values, count)
+        chunks = 0 if saving is None else saving.chunks
+        try:
+            for part in parts:
+                for chunk in part:
+                    values, log_weight, count = chunk
+                    log_weights[0, kept.count : kept.count + count] = log_weight
+                    kept.add(values, count)
+                    if saving is not None:
+                        saving.drawn(chunk)
+                chunks += len(part)
+        except KeyboardInterrupt:
+            self._interrupted(0 if saving is not None else kept.count)
+            log_weights = log_weights[:, : kept.count]
+        stored = kept.finished()
         if resume is not None:
             stored, log_weights = self._joined(resume, stored, log_weights, problem)
         total = log_weights.shape[1]
@@ -137,12 +196,43 @@ class WeightedEngine(Engine):
             (1, total),
             log_weights if weighted else None,
             independent=True,
-            streams=before + len(chunk_sizes(problem.model, self.draws)),
+            streams=before + chunks,
         )
         few = _first(stored, problem)
         posterior.densities = None if few is None else noted_densities(problem, few)
         log_total = float(log_sum_exp(log_weights))
         self._set_evidence(posterior, log_total, total, weighted, log_weights)
+        return posterior
+
+    def _interrupted(self, count: int) -> None:
+        """Go on with the draws made so far, or raise where there are none."""
+        if not count:
+            raise KeyboardInterrupt
+        warnings.warn(
+            f"{type(self).__name__}: interrupted; the posterior has the {count} draws made so far, and "
+            "infer(..., resume=posterior) adds to draws that were kept",
+            InterruptWarning,
+            stacklevel=5,
+        )
+
+    def _spilled(
+        self, problem: Problem, parts: Iterator[list[Chunk]], saving: SavedDraws
+    ) -> DrawsPosterior:
+        """Draws that are never here all at once: they stay in the file."""
+        for part in parts:
+            for chunk in part:
+                saving.drawn(chunk)
+        saving.flush()
+        tail = saving.tail()
+        self._refuse_zero(tail.top, self.draws)
+        streams = chunk_count(problem.model, self.draws)
+        posterior, lazily = saving.posterior(self, tail, self.is_weighted(problem), streams)
+        log_total = tail.top + float(np.log(tail.weight[0]))
+        weighted = self.is_weighted(problem)
+        self._set_evidence(posterior, log_total, self.draws, weighted, tail.tail.values())
+        saving.saver.finish(posterior, lazily)
+        few = _first(posterior._stored, problem)
+        posterior.densities = None if few is None else noted_densities(problem, few)
         return posterior
 
     def _joined(
@@ -265,6 +355,12 @@ class Kept:
             self.stored[name][0, self.count : self.count + count] = value
         self.count += count
 
+    def finished(self) -> dict[str, np.ndarray]:
+        """The draws in place."""
+        if self.count == self.draws:
+            return self.stored
+        return {n: v[:, : self.count] for n, v in self.stored.items()}
+
 
 def passes(
     steps: Sequence[Step],
@@ -319,9 +415,27 @@ def treatment(problem: Problem, name: str) -> str:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _sizes(model: Model, draws: int) -> Iterator[int]:
-    """Sizes of chunks, not listed before there is memory for the draws."""
-    yield from chunk_sizes(model, draws)
+def _units(model: Model, draws: int, first: int, done: int) -> Iterator[tuple[int, list[int]]]:
+    """Units of work: the random stream of the first of some chunks, and how many draws each has.
+
+    They are not listed before there is memory for the draws. Some chunks may have been ``done`` before.
+    """
+    sizes = chunk_sizes(model, draws)
+    for k in range(done, len(sizes), _CHUNKS):
+        yield first + k, sizes[k : k + _CHUNKS]
+
+
+def _unit_drawn(shared: Mapping[str, Any], unit: tuple[int, list[int]]) -> Sums | list[Chunk]:
+    """The draws of some chunks: their sums, or the values of nodes that are kept."""
+    engine, problem, names = shared["engine"], shared["problem"], shared["names"]
+    steps, known = engine.steps(problem), engine.known(problem)
+    chunks = passes(steps, unit[1], shared["seed"], known, unit[0])
+    if not shared["summed"]:
+        return [({n: c.values[n] for n in names}, c.log_weight, c.batch[0]) for c in chunks]
+    sums = Sums(problem.model, names)
+    for chunk in chunks:
+        sums.add(chunk.values, chunk.log_weight, chunk.batch[0])
+    return sums
 
 
 def _first(stored: Mapping[str, np.ndarray], problem: Problem) -> dict[str, np.ndarray] | None:
@@ -329,9 +443,3 @@ def _first(stored: Mapping[str, np.ndarray], problem: Problem) -> dict[str, np.n
     if any(n not in stored and c.kind != "input" for n, c in problem.model.nodes.items()):
         return None
     return {n: v[0, :_COMPARED] for n, v in stored.items()}
-
-
-def _counted(chunks: Iterable[Pass], bar: Progress) -> Iterator[Pass]:
-    for chunk in chunks:
-        yield chunk
-        bar.advance(chunk.batch[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,6 @@ from bayesmc.engines.weighted.drawing import Kept, check_count, no_memory, passe
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import (
-    Pass,
     Step,
     potential_factors,
     refuse_noiseless,
@@ -27,9 +26,11 @@ from bayesmc.network.forward import (
 )
 from bayesmc.progress import Progress
 from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
+from bayesmc.workers import in_order
 
-#: draws of the first chunk; later ones double up to the size that all forward engines use
-_FIRST = 1024
+#: draws of the first chunk; later ones double up to the size that all forward engines use, from where on so
+#: many chunks are one unit of work
+_FIRST, _TOGETHER = 1024, 4
 
 
 @dataclass(frozen=True, repr=False)
@@ -84,6 +85,8 @@ class Rejection(Engine):
     (True, True)
     """
 
+    spreads: ClassVar[bool] = True
+
     draws: int = 1000
     bound: Mapping[str, Any] | None = field(default=None, hash=False)
     max_proposals: int = 10_000_000
@@ -134,6 +137,7 @@ class Rejection(Engine):
         keep: Any = "draws",
         progress: bool | None = None,
         resume: Posterior | None = None,
+        executor: Any = None,
     ) -> Posterior:
         if resume is not None:
             raise UnsupportedError(
@@ -141,14 +145,15 @@ class Rejection(Engine):
                 "same ones"
             )
         names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
-        steps, log_bound = self._steps(problem)
+        log_bound = self._steps(problem)[1]
         summed = isinstance(keep, str) and keep == "summaries"
         kept = names if isinstance(keep, str) else tuple(keep)
         try:
             held = Sums(problem.model, names) if summed else Kept(problem.model, kept, self.draws)
             with Progress(self.draws, "rejection sampling", progress) as bar:
-                chunks = passes(steps, _sizes(problem.model), seed, problem.inputs)
-                proposed = self._fill(held, chunks, problem.model, bar)
+                shared = {"engine": self, "problem": problem, "seed": seed, "names": held.names}
+                units = _units(problem.model, self.max_proposals)
+                proposed = self._fill(held, in_order(_unit_tried, shared, units, executor), bar)
         except MemoryError as error:
             raise no_memory(self, self.draws, kept) from error
         return self._posterior(problem, held, proposed, log_bound)
@@ -177,18 +182,16 @@ class Rejection(Engine):
         ]
         return with_factors(steps, factors), sum(bounds.values())
 
-    def _fill(self, held: Kept | Sums, chunks: Iterator[Pass], model: Model, bar: Progress) -> int:
-        """Accept draws until there are enough; the number proposed up to the last accepted one."""
+    def _fill(self, held: Kept | Sums, units: Iterator[list[Tried]], bar: Progress) -> int:
+        """Take accepted draws until there are enough; the number proposed up to the last of them."""
         accepted = proposed = 0
-        for chunk in chunks:
-            count = min(chunk.batch[0], self.max_proposals - proposed)
-            level = np.broadcast_to(np.exp(chunk.log_weight), chunk.batch)
-            picked = np.flatnonzero(chunk.rng.random(chunk.batch) < level)
-            picked = picked[picked < count][: self.draws - accepted]
+        for tried in (one for unit in units for one in unit):
+            count = min(tried.proposed, self.max_proposals - proposed)
+            picked = tried.picked[tried.picked < count][: self.draws - accepted]
             if len(picked):
                 values = {
-                    name: value[picked] if value.ndim > len(model[name].value_shape) else value
-                    for name, value in chunk.values.items()
+                    name: value[: len(picked)] if name in tried.varying else value
+                    for name, value in tried.values.items()
                 }
                 if isinstance(held, Sums):
                     held.add(values, 0.0, len(picked))
@@ -277,13 +280,54 @@ class RejectionSums(_Accepted, SumsPosterior):
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _sizes(model: Model) -> Iterator[int]:
-    """Sizes of chunks that do not depend on the draws asked for, so that more begin with the same."""
+class Tried(NamedTuple):
+    """A chunk of proposed draws.
+
+    Attributes
+    ----------
+    proposed : int
+    picked : ndarray of int
+        Which were accepted.
+    values : dict
+        Stored values of these.
+    varying : set of str
+        Nodes that have a value for each draw.
+    """
+
+    proposed: int
+    picked: np.ndarray
+    values: dict[str, np.ndarray]
+    varying: set[str]
+
+
+def _units(model: Model, most: int) -> Iterator[tuple[int, list[int]]]:
+    """Units of work: the random stream of the first of some chunks, and how many draws each has.
+
+    They do not depend on the draws asked for, so that more begin with the same ones.
+    """
     largest = chunk_sizes(model, CHUNK)[0]
-    size = min(_FIRST, largest)
-    while True:
-        yield size
+    size, number, proposed = min(_FIRST, largest), 0, 0
+    while proposed < most:
+        sizes = [size] * (_TOGETHER if size == largest else 1)
+        yield number, sizes
+        number, proposed = number + len(sizes), proposed + sum(sizes)
         size = min(2 * size, largest)
+
+
+def _unit_tried(shared: Mapping[str, Any], unit: tuple[int, list[int]]) -> list[Tried]:
+    """Draws proposed in some chunks, and which of them are accepted."""
+    engine, problem, names = shared["engine"], shared["problem"], shared["names"]
+    shapes = {n: len(problem.model[n].value_shape) for n in names}
+    found = []
+    for chunk in passes(
+        engine._steps(problem)[0], unit[1], shared["seed"], problem.inputs, unit[0]
+    ):
+        level = np.broadcast_to(np.exp(chunk.log_weight), chunk.batch)
+        picked = np.flatnonzero(chunk.rng.random(chunk.batch) < level)
+        varying = {n for n in names if chunk.values[n].ndim > shapes[n]}
+        values = {n: chunk.values[n][picked] if n in varying else chunk.values[n] for n in names}
+        found.append(Tried(chunk.batch[0], picked, values, varying))
+    return found
 
 
 def _checked_bounds(bound: Any) -> Mapping[str, Any]:

@@ -1,0 +1,315 @@
+"""``load``, and the files of runs: whether one belongs to the call that is made, and what is in it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy
+
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem
+from bayesmc.engines.unrolled import pose_any
+from bayesmc.errors import CheckpointError, FileFormatError, ModelError, UnsupportedError
+from bayesmc.network import BayesNet, FactorGraph, Problem
+from bayesmc.network.fingerprint import Fingerprint, digest, evidence_fingerprint, fingerprint
+from bayesmc.randomness import seed_sequence
+from bayesmc.results import Posterior, RunFile
+from bayesmc.results.saving import ANSWER, RUN, observed_variables
+from bayesmc.states import StateArray
+from bayesmc.storage import CheckpointFile, Group, open_image, packed, unpacked, write_image
+from bayesmc.storage.blocks import refused
+from bayesmc.storage.image import Stored, libraries
+
+#: what can be told of a value in a message
+_SHOWN = 60
+
+
+def load(
+    path: str | os.PathLike[str], net: BayesNet | FactorGraph | DynamicBayesNet | None = None
+) -> Any:
+    """What ``posterior.save(path)`` or ``checkpoint=path`` wrote: a posterior, one over time, or a belief.
+
+    Nothing in a file is run. Functions are not in it: what needs none is answered at once (means, quantiles,
+    tables, expectations over draws, ...); the rest (``predict``, going on with ``resume=``) needs the net.
+
+    Parameters
+    ----------
+    path : path
+    net : BayesNet, FactorGraph or DynamicBayesNet, optional
+        The net that the question was about, declared again; it is compared with the one of the file. A belief
+        goes on with ``engine.start(dbn, belief=bmc.load(path))``.
+
+    Returns
+    -------
+    Posterior, SeriesPosterior or belief
+        Of a run that has not ended, what it has come to so far.
+
+    Raises
+    ------
+    FileNotFoundError, MissingExtraError
+    DamagedFileError
+        The file is cut off.
+    FileFormatError
+        It is none of ours, or of another version.
+    CheckpointError
+        The net is another one; the message says where.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Normal(0.0, 1.0))
+    >>> net.add("y", lambda x: bmc.Normal(x, 1.0))
+    >>> bmc.infer(net, {"y": 1.0}).save("exact.nc")  # doctest: +SKIP
+    >>> bmc.load("exact.nc").mean("x")  # doctest: +SKIP
+    0.5
+    """
+    path = Path(path)
+    image = open_image(path)
+    kind = image.attributes.get("kind")
+    if kind == RUN:
+        answer, header = _so_far(path)
+    elif kind == ANSWER:
+        found = unpacked(image.packed, Stored(path))
+        answer, header = found["answer"], found["header"] or {}
+    else:
+        raise FileFormatError(f"{path}: bayesmc does not know what a {kind!r} is")
+    return answer if net is None else _with_net(path, answer, header, net)
+
+
+class Opened:
+    """The file of a run, as a call finds it.
+
+    Parameters
+    ----------
+    call : str
+        ``"infer"`` or ``"filter"``.
+    checkpoint : path or CheckpointFile
+    problem : Problem or SeriesProblem
+    """
+
+    def __init__(self, call: str, checkpoint: Any, problem: Problem | SeriesProblem) -> None:
+        self.call, self.problem = call, problem
+        self.file = CheckpointFile.of(checkpoint)
+        self.path = Path(self.file.path)
+        libraries()
+        self.header: Mapping[str, Any] | None = None
+        self.image = None
+        if self.path.exists():
+            self.image = open_image(self.path)
+            self.header = unpacked(self.image.packed, _nothing)["header"]
+            if not self.header or "identity" not in self.header:
+                raise CheckpointError(
+                    f"{call}(checkpoint={str(self.path)!r}): the file holds an answer that was saved, and "
+                    "no run; give another path (bmc.load reads it)"
+                )
+
+    @property
+    def engine(self) -> Any:
+        """The engine of the run; None where none has begun."""
+        return None if self.header is None else self.header["engine"]
+
+    def seed(self, rng: Any) -> np.random.SeedSequence:
+        """The run's own, where the call gives none."""
+        if rng is None and self.header is not None:
+            found: np.random.SeedSequence = self.header["seed"]
+            return found
+        return seed_sequence(rng)
+
+    def begin(
+        self, engine: Any, seed: np.random.SeedSequence, keep: Any, more: Mapping[str, Any]
+    ) -> Begun:
+        """The file of the run, made or gone on with, or its answer.
+
+        Parameters
+        ----------
+        more : dict
+            Other arguments of the call, by name.
+
+        Raises
+        ------
+        CheckpointError
+            The file is of another run; the message says what differs.
+        """
+        identity = _identity(self.problem, engine, seed, {"keep": keep, **more})
+        if self.header is None:
+            header = self._made(identity, engine, seed, keep)
+        else:
+            header = self.header
+            if why := _difference(header["identity"], identity):
+                raise CheckpointError(
+                    f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; "
+                    "make the same call to go on with it, or give another path"
+                )
+            if self.image is not None and self.image.attributes["kind"] == ANSWER:
+                with suppress(UnsupportedError):  # of an approximation, which is made again
+                    return Begun(None, self._answer(keep))
+        return Begun(RunFile(self.file, header), None)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _made(
+        self, identity: Fingerprint, engine: Any, seed: np.random.SeedSequence, keep: Any
+    ) -> Mapping[str, Any]:
+        problem = self.problem
+        header = {"identity": identity, "engine": engine, "seed": seed, "keep": keep}
+        groups: dict[str, Group] = {}
+        held: dict[str, Any] = dict(header)
+        if isinstance(problem, Problem):
+            model = problem.model
+            coordinates = {p: model.labels.get(p, range(n)) for p, n in model.sizes.items()}
+            groups["observed_data"] = Group(
+                observed_variables(model, problem.observed), coordinates
+            )
+            held |= {"observed": problem.observed, "inputs": problem.inputs}
+            held["model"] = model.without_functions()
+        try:
+            write_image(self.path, groups, packed({"header": held}), {"kind": RUN})
+        except OSError as error:
+            raise refused(self.path, error) from error
+        return header
+
+    def _answer(self, keep: Any) -> Any:
+        spilled = keep == "file" or isinstance(keep, Mapping)
+        assert self.image is not None
+        answer = unpacked(self.image.packed, Stored(self.path, mapped=spilled))["answer"]
+        if isinstance(answer, Posterior) and isinstance(self.problem, Problem):
+            answer.bind(self.problem)
+        return answer
+
+
+class Begun(NamedTuple):
+    """The file of a run that goes on, or the answer of one that has ended."""
+
+    file: RunFile | None
+    answer: Any
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _nothing(name: str) -> np.ndarray:
+    """In the place of arrays that nobody looks at."""
+    return np.empty(0)
+
+
+def _identity(
+    problem: Any, engine: Any, seed: np.random.SeedSequence, more: Mapping[str, Any]
+) -> Fingerprint:
+    """What a run is: two that agree in it end with the same bits."""
+    name = type(engine).__name__
+    found: Fingerprint = {"the engine": f"={name}"}
+    options = [f.name for f in fields(engine)] if is_dataclass(engine) else sorted(vars(engine))
+    found |= {f"{name}({o}=)": _shown(getattr(engine, o)) for o in options}
+    if isinstance(problem, SeriesProblem):
+        series = problem.series
+        found |= {f"slice 0: {k}": v for k, v in fingerprint(problem.slices.first).items()}
+        found |= {f"later slices: {k}": v for k, v in fingerprint(problem.slices.later).items()}
+        found["the number of rows"] = f"={series.steps}"
+        found |= evidence_fingerprint(series.observed, "observations")
+        found |= evidence_fingerprint(series.static)
+        inputs = series.inputs
+    else:
+        found |= fingerprint(problem.model)
+        found |= evidence_fingerprint(problem.observed)
+        inputs = problem.inputs
+    found |= {f"the input {n!r}": digest(v) for n, v in inputs.items()}
+    key = f"={seed.entropy}" + (f", {seed.spawn_key}" if seed.spawn_key else "")
+    found["the seed (rng=)"] = key
+    found |= {f"{n}=": _shown(v) for n, v in more.items()}
+    fast = importlib.util.find_spec("llvmlite") is not None
+    versions = {
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "Python": platform.python_version(),
+    }
+    found |= {f"the version of {n}": f"={v}" for n, v in versions.items()}
+    found["machine code (the extra fast)"] = "=there" if fast else "=not there"
+    return found
+
+
+def _shown(value: Any) -> str:
+    simple = value is None or isinstance(value, (bool, int, float, str))
+    plain = simple or (isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value))
+    text = repr(list(value) if isinstance(value, tuple) else value) if plain else ""
+    return f"={text}" if plain and len(text) <= _SHOWN else digest(value)
+
+
+def _difference(was: Fingerprint, now: Fingerprint) -> str | None:
+    """The first thing in which two runs differ, in words."""
+    for what in (*was, *(w for w in now if w not in was)):
+        a, b = was.get(what), now.get(what)
+        if a == b:
+            continue
+        if a is None or b is None:
+            return f"{what} is {'not there any more' if b is None else 'new'}"
+        if a.startswith("=") and b.startswith("="):
+            return f"{what} was {a[1:]} and is {b[1:]} now"
+        return f"{what} is another one"
+    return None
+
+
+def _so_far(path: Any) -> tuple[Any, Mapping[str, Any]]:
+    """What a run has come to that has not ended."""
+    header = unpacked(open_image(path).packed)["header"]
+    run = RunFile(CheckpointFile(path), header, alone=False)
+    engine = header["engine"]
+    answer = None
+    if hasattr(engine, "so_far") and "model" in header:
+        problem = Problem(None, header["model"], header["observed"], header["inputs"])  # type: ignore[arg-type]
+        answer = engine.so_far(problem, run)
+    if answer is None:
+        raise UnsupportedError(
+            f"{path}: the run has not ended, and has no answer yet; make the same call again to go on with it"
+        )
+    answer.problem = None
+    return answer, header
+
+
+def _with_net(path: Any, answer: Any, header: Mapping[str, Any], net: Any) -> Any:
+    """A posterior with the functions of its net."""
+    if not isinstance(answer, Posterior):
+        raise ModelError(
+            f"load(net=): a {type(answer).__name__} answers without a net; a belief goes on with "
+            "engine.start(dbn, belief=bmc.load(path))"
+        )
+    inputs = dict(getattr(answer, "_known", {}))
+    evidence = {n: _given(answer.model[n], o) for n, o in answer._seen.items()}
+    if isinstance(net, DynamicBayesNet):
+        raise ModelError(
+            "load(net=): the answer is about an unrolled net; give net=dbn.unroll(steps), with its inputs"
+        )
+    problem = pose_any(net, evidence, inputs or None)
+    was = header.get("fingerprint", header.get("identity", {}))
+    now = fingerprint(problem.model)
+    if why := _difference({k: v for k, v in was.items() if k in now}, now) if was else None:
+        raise CheckpointError(
+            f"load({str(path)!r}, net=...): the answer is about another net: {why}"
+        )
+    answer.bind(problem)
+    return answer
+
+
+def _given(node: Any, seen: Any) -> Any:
+    """Evidence as the user gave it."""
+    values = node.decode(seen.value)
+    hidden = None
+    if seen.mask is not None:
+        hidden = np.broadcast_to(
+            ~seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape)), node.value_shape
+        )
+        if seen.parts is not None:
+            hidden = hidden & ~seen.parts
+    if isinstance(values, StateArray):
+        labels = np.array(values.labels, dtype=object)
+        if hidden is not None:
+            labels[hidden] = None
+        return labels if labels.ndim else labels.item()
+    return values if hidden is None else np.ma.masked_array(values, hidden)

@@ -1,0 +1,178 @@
+"""Expectation-maximisation of tables: the loop, Dirichlet counts, and standard errors at its end."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+Tables = dict[str, np.ndarray]
+#: from tables to the log likelihood and the expected counts of their entries
+Expected = Callable[[Mapping[str, np.ndarray]], tuple[float, Mapping[str, np.ndarray]]]
+#: entries of tables up to which their curvature is worked out
+_MOST = 300
+
+
+@dataclass(frozen=True, eq=False)
+class Learned:
+    """Where expectation-maximisation ended.
+
+    Attributes
+    ----------
+    tables : dict
+    log_likelihood : float
+    objective : float
+    history : ndarray
+    converged : bool
+    errors : dict
+        Standard errors of all entries; NaN where they are not told.
+    """
+
+    tables: Tables
+    log_likelihood: float
+    objective: float
+    history: np.ndarray
+    converged: bool
+    errors: Tables
+
+
+def maximised(
+    expected: Expected, start: Tables, counts: Mapping[str, np.ndarray], tolerance: float, most: int
+) -> Learned:
+    """Tables from where they start; each iteration leaves the objective as high as it was, or higher.
+
+    Parameters
+    ----------
+    expected : callable
+    start : dict
+        Rows over the last axis sum to 1.
+    counts : dict
+        Dirichlet counts, added to those expected; the objective has their log prior in it.
+    tolerance : float
+        Rise of the objective below which it ends, in nats.
+    """
+    tables = {n: np.array(t) for n, t in start.items()}
+    log_likelihood, found = expected(tables)
+    history = [log_likelihood + _log_prior(tables, counts)]
+    converged = False
+    for _ in range(most):
+        tables = {n: _normalised(found[n] + counts[n], tables[n]) for n in tables}
+        log_likelihood, found = expected(tables)
+        history.append(log_likelihood + _log_prior(tables, counts))
+        if history[-1] - history[-2] < tolerance:
+            converged = True
+            break
+    errors = _errors(expected, tables, counts)
+    return Learned(tables, log_likelihood, history[-1], np.array(history), converged, errors)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _normalised(counts: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """Rows in proportion to counts; a row that nothing was counted in stays."""
+    total = counts.sum(axis=-1, keepdims=True)
+    return np.where(total > 0, counts / np.where(total > 0, total, 1.0), before)
+
+
+def _log_prior(tables: Tables, counts: Mapping[str, np.ndarray]) -> float:
+    total = 0.0
+    for name, table in tables.items():
+        added = np.broadcast_to(counts[name], table.shape)
+        with np.errstate(divide="ignore"):
+            logs = np.log(np.where(added > 0, table, 1.0))
+        total += float((added * logs).sum())
+    return total
+
+
+def _errors(expected: Expected, tables: Tables, counts: Mapping[str, np.ndarray]) -> Tables:
+    """From the observed information in log ratios: its gradient is what counts are off (Fisher's identity).
+
+    Louis (1982), JRSS B 44, eq. 3.1; entries at the edge, and rows with one entry inside, have none.
+    """
+    inside = {n: (t > 1e-6) & (t < 1 - 1e-6) for n, t in tables.items()}
+    size = sum(int(mask.sum()) for mask in inside.values())
+    unknown = {n: np.full(t.shape, np.nan) for n, t in tables.items()}
+    if not 0 < size <= _MOST:
+        return unknown
+
+    def gradient(at: Tables) -> np.ndarray:
+        _, found = expected(at)
+        parts = []
+        for n, table in at.items():
+            seen = found[n] + counts[n]
+            parts.append((seen - seen.sum(axis=-1, keepdims=True) * table)[inside[n]])
+        return np.concatenate(parts)
+
+    def moved(k: int, step: float) -> Tables:
+        shift, at = np.zeros(size), {}
+        shift[k], start = step, 0
+        for n, table in tables.items():
+            own = np.zeros(table.shape)
+            many = int(inside[n].sum())
+            own[inside[n]] = shift[start : start + many]
+            start += many
+            new = table * np.exp(own)
+            at[n] = new / new.sum(axis=-1, keepdims=True)
+        return at
+
+    information = np.empty((size, size))
+    for k in range(size):
+        information[k] = -(gradient(moved(k, 1e-4)) - gradient(moved(k, -1e-4))) / 2e-4
+    information = 0.5 * (information + information.T)
+    # each row's log ratios are told up to a constant: the pseudo-inverse leaves it out
+    values, vectors = np.linalg.eigh(information)
+    told = values > 1e-7 * max(values.max(), 1e-300)
+    covariance = (vectors[:, told] / values[told]) @ vectors[:, told].T
+    lost = _untold(information, values, vectors, tables, inside)
+    return _spread(covariance, lost, tables, inside)
+
+
+def _untold(
+    information: np.ndarray,
+    values: np.ndarray,
+    vectors: np.ndarray,
+    tables: Tables,
+    inside: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """Entries that enter directions without curvature besides that of each row's sum."""
+    rows = []
+    start = 0
+    for n in tables:
+        flat = inside[n].reshape(-1, inside[n].shape[-1])
+        for row in flat:
+            many = int(row.sum())
+            if many:
+                free = np.zeros(len(information))
+                free[start : start + many] = 1.0 / math.sqrt(many)
+                rows.append(free)
+            start += many
+    known = np.array(rows).reshape(-1, len(information))
+    flat_directions = vectors[:, values <= 1e-7 * max(values.max(), 1e-300)]
+    rest = flat_directions - known.T @ (known @ flat_directions)
+    return (np.abs(rest) > 1e-3).any(axis=1)
+
+
+def _spread(
+    covariance: np.ndarray, lost: np.ndarray, tables: Tables, inside: Mapping[str, np.ndarray]
+) -> Tables:
+    """Standard errors of probabilities from the covariance of log ratios (delta method)."""
+    found: Tables = {}
+    start = 0
+    for n, table in tables.items():
+        errors = np.full(table.shape, np.nan)
+        for at in np.ndindex(table.shape[:-1]):
+            mask = inside[n][at]
+            many = int(mask.sum())
+            own = slice(start, start + many)
+            start += many
+            if many < 2 or lost[own].any():
+                continue
+            p = table[at][mask]
+            jacobian = np.diag(p) - np.outer(p, p)
+            variance = np.diagonal(jacobian @ covariance[own, own] @ jacobian)
+            errors[at][mask] = np.sqrt(np.maximum(variance, 0.0))
+        found[n] = errors
+    return found

@@ -1,0 +1,90 @@
+"""``Fit``: what was learned, with its errors, and the net in which it stands."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import UnknownNodeError, did_you_mean
+from bayesmc.results.table import Summary
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Parameters learned from data; made by ``bayesmc.fit``.
+
+    Attributes
+    ----------
+    net : BayesNet or DynamicBayesNet
+        The one given, with what was learned in place: nodes fixed at their values, tables filled in.
+    values : dict
+        Node -> estimate, shape ``(*plates, *event)``; of tables probabilities, the parents' axes first (the
+        initial ones of a template's node ``x`` under ``"x initial"``).
+    std_errors : dict
+        Node -> standard error of every number, from the curvature of the log likelihood (of the log
+        posterior, with ``prior=True``) at the maximum; NaN where a number lies at the edge of its support or
+        the data do not tell it.
+    log_likelihood : float
+        Of the data at the estimates, everything hidden summed out.
+    objective : float
+        What was maximised: ``log_likelihood``, and with ``prior=True`` the log prior in it.
+    history : ndarray
+        The objective after each iteration.
+    converged : bool
+    iterations : int
+    method : str
+    covariance : ndarray or None
+        Of the numbers in ``labels``.
+    labels : tuple of str
+    """
+
+    net: Any
+    values: Mapping[str, np.ndarray]
+    std_errors: Mapping[str, np.ndarray]
+    log_likelihood: float
+    objective: float
+    history: np.ndarray
+    converged: bool
+    iterations: int
+    method: str
+    covariance: np.ndarray | None = field(default=None, repr=False)
+    labels: tuple[str, ...] = ()
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self.values:
+            raise UnknownNodeError(
+                f"fit: {name!r} was not learned{did_you_mean(name, list(self.values))}; learned are "
+                f"{', '.join(map(repr, self.values))}"
+            )
+        return self.values[name]
+
+    def summary(self) -> Summary:
+        """A row for each number: its estimate, standard error, and the ends of a 95 % interval."""
+        names: list[str] = []
+        rows: list[tuple[float, float]] = []
+        for name, value in self.values.items():
+            errors = self.std_errors.get(name, np.full(np.shape(value), np.nan))
+            own = [label for label in self.labels if label == name or label.startswith(f"{name}[")]
+            for k, at in enumerate(np.ndindex(np.shape(value))):
+                inside = f"{name}[{', '.join(map(str, at))}]" if at else name
+                names.append(own[k] if len(own) == np.size(value) else inside)
+                rows.append((float(value[at]), float(errors[at])))
+        estimate, error = np.array(rows, dtype=float).reshape(-1, 2).T
+        columns = {
+            "estimate": estimate,
+            "se": error,
+            "2.5%": estimate - 1.959964 * error,
+            "97.5%": estimate + 1.959964 * error,
+        }
+        return Summary(tuple(names), columns, self._title())
+
+    def _title(self) -> str:
+        how = "converged" if self.converged else "NOT converged"
+        told = f"log likelihood {self.log_likelihood:.4f}, {how} after {self.iterations} iterations"
+        return f"{self.method}: {told}"
+
+    def __repr__(self) -> str:
+        return f"Fit({', '.join(self.values)}; {self._title()})"

@@ -1,0 +1,412 @@
+"""Images: NetCDF files that are written whole and put in place at once.
+
+NetCDF is HDF5 with names for axes: ``xarray.open_datatree(path)`` and ArviZ read it. Ours has one group
+besides (``bayesmc``), which holds what was saved as packed bytes, and says how far the blocks behind it
+reach.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import glob
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.errors import DamagedFileError, FileFormatError, missing_extra
+
+#: of the layout of files; one that is newer is refused
+VERSION = 1
+#: the group that is ours, what is packed in it, and where blocks end
+GROUP, PACKED, END = "bayesmc", "packed", "end"
+
+
+class Lazy(NamedTuple):
+    """An array that is written piece by piece.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    dtype : dtype
+    pieces : callable
+        Pairs of an index and the array that belongs there.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    pieces: Callable[[], Iterator[tuple[Any, np.ndarray]]]
+
+
+class Variable(NamedTuple):
+    """A named array of a group."""
+
+    dims: tuple[str, ...]
+    data: Any
+    attributes: Mapping[str, Any] = {}
+
+
+@dataclass(frozen=True)
+class Group:
+    """Variables, and the labels of their axes."""
+
+    variables: Mapping[str, Variable]
+    coordinates: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Image:
+    """What stands in an image.
+
+    Attributes
+    ----------
+    packed : bytes
+    attributes : dict
+        Of our group.
+    size : int
+        Bytes of the file up to its first block.
+    end : int
+        And up to the end of its last one.
+    end_at : int
+        Where that number stands in the file.
+    """
+
+    packed: bytes
+    attributes: Mapping[str, Any]
+    size: int
+    end: int
+    end_at: int
+
+
+def write_image(
+    path: str | Path,
+    groups: Mapping[str, Group],
+    packed: Sequence[Any],
+    attributes: Mapping[str, Any],
+) -> None:
+    """Write a file whole, and put it in the place of any that is there: readers see the one or the other.
+
+    Parameters
+    ----------
+    path : path
+    groups : dict
+        Name -> ``Group``.
+    packed : sequence of bytes
+        Parts of what ``storage.packed`` made.
+    attributes : dict
+        Of our group: numbers and text.
+
+    Raises
+    ------
+    MissingExtraError
+        Without h5netcdf (the extra ``netcdf``).
+    OSError
+        The disk is full, or may not be written; what was there is left as it is.
+    """
+    path = Path(path)
+    h5py, h5netcdf = libraries()
+    with replacing(path) as new, _Patient(new) as raw_file:
+        with h5netcdf.File(raw_file, "w") as file:
+            for name, group in groups.items():
+                _write_group(h5py, file.create_group(name), group)
+            ours = file.create_group(GROUP)
+            size = sum(len(part) for part in packed)
+            ours.dimensions = {"byte": size, "reach": 2}
+            ours.attrs.update({"format": VERSION, **attributes})
+            held = ours.create_variable(PACKED, ("byte",), np.uint8)._h5ds
+            at = 0
+            for part in packed:
+                piece = np.frombuffer(part, np.uint8)
+                if len(piece):
+                    held[at : at + len(piece)] = piece
+                at += len(piece)
+            end = ours.create_variable(END, ("reach",), np.int64)._h5ds
+            end[...] = 0
+            where = int(end.id.get_offset())
+        raw_file.settle()
+        with open(new, "r+b", buffering=0) as raw:
+            size = os.fstat(raw.fileno()).st_size
+            set_end(raw.fileno(), where, size)
+            set_end(raw.fileno(), where + 8, size)
+
+
+def open_image(path: str | Path) -> Image:
+    """Read an image; blocks behind it are not looked at.
+
+    Raises
+    ------
+    FileNotFoundError
+    MissingExtraError
+    DamagedFileError
+        It is cut off.
+    FileFormatError
+        It is no file of ours, or of a version to come.
+    """
+    h5py, _ = libraries()
+    with _opened(h5py, path) as file:
+        if GROUP not in file or PACKED not in file[GROUP]:
+            raise FileFormatError(
+                f"{path}: a file of this kind, but not one that bayesmc wrote; open it with xarray or ArviZ"
+            )
+        ours = file[GROUP]
+        attributes = {k: _plain(v) for k, v in ours.attrs.items() if not k.startswith("_")}
+        if attributes.get("format", 0) > VERSION:
+            raise FileFormatError(
+                f"{path}: written by a later bayesmc (format {attributes['format']}, this one reads up to "
+                f"{VERSION}); read it with that version"
+            )
+        held = ours[END]
+        size, end = (int(n) for n in held[...])
+        where = int(held.id.get_offset()) + 8
+        return Image(ours[PACKED][...].tobytes(), attributes, size, end, where)
+
+
+def is_ours(path: str | Path) -> bool:
+    """Whether a file is one that bayesmc wrote, as far as it can be read."""
+    try:
+        open_image(path)
+    except (OSError, FileFormatError):
+        return False
+    return True
+
+
+class Stored:
+    """Arrays of an image by name, read whole or left in the file.
+
+    Parameters
+    ----------
+    path : path
+    mapped : bool
+        Leave them in the file: pages are read when they are looked at.
+    """
+
+    def __init__(self, path: str | Path, mapped: bool = False) -> None:
+        self.path, self.mapped = path, mapped
+
+    def __call__(self, name: str) -> np.ndarray:
+        h5py, _ = libraries()
+        with _opened(h5py, self.path) as file:
+            if name not in file:
+                raise FileFormatError(f"{self.path}: {name} is missing; the file is damaged")
+            held = file[name]
+            offset = held.id.get_offset()
+            if not self.mapped or offset is None or not held.size:
+                found = held[...]
+                found.flags.writeable = False
+                return found
+            shape, dtype = held.shape, held.dtype
+        return np.memmap(self.path, dtype, "r", offset, shape)
+
+
+def libraries() -> tuple[Any, Any]:
+    """h5py and h5netcdf.
+
+    Raises
+    ------
+    MissingExtraError
+    """
+    try:
+        import h5netcdf
+        import h5py
+    except ImportError as error:
+        raise missing_extra((error.name or "h5netcdf").partition(".")[0], "netcdf") from None
+    return h5py, h5netcdf
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[str]:
+    """The name of a new file, which takes the place of another one once all of it is on the disk."""
+    try:
+        handle, new = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".new", dir=path.parent)
+    except FileNotFoundError:
+        raise FileNotFoundError(f"{path}: there is no folder {path.parent}") from None
+    os.close(handle)
+    try:
+        mask = os.umask(0)
+        os.umask(mask)
+        os.chmod(new, 0o666 & ~mask)
+        yield new
+        with open(new, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(new, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(new)
+        raise
+    with contextlib.suppress(OSError):  # not every system lets folders be opened
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
+
+
+def clear_leftovers(path: Path) -> None:
+    """Remove what processes that were killed left of files that were to take the place of this one."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.new"):
+        with contextlib.suppress(OSError):
+            left.unlink()
+
+
+def set_end(handle: int, where: int, end: int) -> None:
+    """Say how far a file reaches: eight bytes, which are there whole or not at all."""
+    os.lseek(handle, where, os.SEEK_SET)
+    os.write(handle, int(end).to_bytes(8, "little"))
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Patient:
+    """A file that takes all that is written, and says in the end what went wrong.
+
+    HDF5 does not survive a disk that is full: it fails again and again as it closes its file, and may take
+    the process with it.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._file = open(path, "r+b", buffering=0)  # noqa: SIM115 - closed on the way out
+        self._error: OSError | None = None
+        self._size = self._at = 0
+
+    def settle(self) -> None:
+        """Raise what went wrong.
+
+        Raises
+        ------
+        OSError
+        """
+        if self._error is not None:
+            raise self._error
+
+    def __enter__(self) -> _Patient:
+        return self
+
+    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
+        self._file.close()
+        if self._error is not None and error is not self._error:
+            raise self._error
+
+    def write(self, data: Any) -> int:
+        view = memoryview(data).cast("B")
+        try:
+            at = self._at
+            while self._error is None and at < self._at + len(view):
+                self._file.seek(at)
+                at += self._file.write(view[at - self._at :]) or 0
+        except OSError as error:
+            self._error = error
+        self._at += len(view)
+        self._size = max(self._size, self._at)
+        return len(view)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        self._file.seek(self._at)
+        count = self._file.readinto(view) or 0
+        view[count:] = bytes(len(view) - count)
+        self._at += len(view)
+        return len(view)
+
+    def read(self, count: int) -> bytes:
+        data = bytearray(count)
+        self.readinto(data)
+        return bytes(data)
+
+    def seek(self, offset: int, whence: int = 0) -> int:
+        self._at = offset + (0, self._at, self._size)[whence]
+        return self._at
+
+    def tell(self) -> int:
+        return self._at
+
+    def truncate(self, size: int | None = None) -> int:
+        size = self._at if size is None else size
+        try:
+            if self._error is None:
+                self._file.truncate(size)
+        except OSError as error:
+            self._error = error
+        self._size = size
+        return size
+
+    def flush(self) -> None:
+        """There is nothing that waits."""
+
+
+@contextmanager
+def _opened(h5py: Any, path: str | Path) -> Iterator[Any]:
+    if not Path(path).exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    try:
+        file = _open_unlocked(h5py, path)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    with file:
+        yield file
+
+
+def _open_unlocked(h5py: Any, path: str | Path) -> Any:
+    """Open a file for reading, where it may be locked or cannot be."""
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if "lock" not in str(error):
+            raise
+        return h5py.File(path, "r", locking=False)
+
+
+def _unreadable(path: str | Path, error: OSError) -> Exception:
+    size = Path(path).stat().st_size
+    with open(path, "rb") as file:
+        first = file.read(8)
+    if first == b"\x89HDF\r\n\x1a\n" or not size:
+        return DamagedFileError(
+            f"{path}: the file is cut off, or damaged, before its first block ({size} bytes are there; "
+            f"{error}): nothing of it can be gone on with; move it away and call again",
+            0,
+        )
+    return FileFormatError(f"{path}: this is no NetCDF-4 file ({error})")
+
+
+def _write_group(h5py: Any, group: Any, given: Group) -> None:
+    sizes: dict[str, int] = {}
+    for variable in given.variables.values():
+        shape = variable.data.shape if hasattr(variable.data, "shape") else np.shape(variable.data)
+        sizes.update(zip(variable.dims, shape, strict=True))
+    group.dimensions = sizes
+    for name, labels in given.coordinates.items():
+        if name in sizes:
+            values = np.asarray(labels)
+            if values.dtype.kind not in "iuf":
+                values = np.array([str(v) for v in labels], dtype=object)
+            _write(h5py, group, name, Variable((name,), values))
+    for name, variable in given.variables.items():
+        _write(h5py, group, name, variable)
+
+
+def _write(h5py: Any, group: Any, name: str, variable: Variable) -> None:
+    data = variable.data
+    lazy = data if isinstance(data, Lazy) else None
+    array = None if lazy is not None else np.asarray(data)
+    dtype: Any = lazy.dtype if lazy is not None else array.dtype  # type: ignore[union-attr]
+    if dtype.kind in "OU":
+        array, dtype = np.asarray(array, dtype=object), h5py.string_dtype()
+    if dtype.kind == "b":
+        dtype = np.dtype(np.int8)
+    made = group.create_variable(name.replace("/", "∕"), variable.dims, dtype)
+    for key, value in variable.attributes.items():
+        made.attrs[key] = value
+    held = made._h5ds
+    for at, piece in [(..., array)] if lazy is None else lazy.pieces():
+        if held.size:
+            held[at] = piece
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value

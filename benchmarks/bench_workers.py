@@ -1,0 +1,189 @@
+"""Units of work on two processes beside one and none, many questions at once, and islands of particles.
+
+``python -m benchmarks.bench_workers`` times; with ``--islands 2000`` it runs the filter with 1, 4 and 16
+islands so often and prints means and variances of the evidence instead. Wall times of several processes say
+little while the machine does something else: look at the load.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+
+import bayesmc as bmc
+from benchmarks.harness import Peer, data_folder, network, peer_python, table
+
+SETS, LOOPED, ASKED = 10_000, 400, 200
+ROUNDS = 3
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--islands", type=int, default=0, metavar="RUNS")
+    options = parser.parse_args(arguments)
+    warnings.simplefilter("ignore")
+    if options.islands:
+        print(islands(options.islands))
+        return
+    print(f"load before: {os.getloadavg()[0]:.2f} on {os.cpu_count()} cores\n")
+    print(shared_out() + "\n")
+    if data_folder().exists():
+        print(many_questions() + "\n")
+    print(f"load after: {os.getloadavg()[0]:.2f}")
+
+
+def shared_out() -> str:
+    """Wall seconds here, on one process and on two."""
+    rows: list[list[object]] = []
+    for name, run in (
+        ("8 series of about 1 s", lambda e: series(8, 250_000, e)),
+        ("64 series", lambda e: series(64, 30_000, e)),
+        ("8 chains in 2 groups", chains),
+    ):
+        here, one, two = timed(run)
+        rows.append([name, here, one, two, 100 * (one / here - 1), one / two])
+    header = ["what", "here, s", "1 worker, s", "2 workers, s", "overhead, %", "2 over 1"]
+    return table("the same work shared out (wall time, best of rounds in turn)", header, rows)
+
+
+def timed(run: Callable[[Any], None]) -> tuple[float, float, float]:
+    best = [np.inf] * 3
+    with processes(1) as one, processes(2) as two:
+        executors = [None, one, two]
+        for executor in executors:
+            run(executor)  # workers import and compile
+        for _ in range(ROUNDS):
+            for k, executor in enumerate(executors):
+                start = time.perf_counter()
+                run(executor)
+                best[k] = min(best[k], time.perf_counter() - start)
+    return best[0], best[1], best[2]
+
+
+@contextmanager
+def processes(count: int) -> Iterator[Executor]:
+    with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
+def series(count: int, particles: int, executor: Any) -> None:
+    rng = np.random.default_rng(0)
+    rows = [{"y": rng.normal(size=50)} for _ in range(count)]
+    bmc.filter(WALK, rows, engine=bmc.ParticleFilter(particles), rng=1, executor=executor)
+
+
+def chains(executor: Any) -> None:
+    engine = bmc.Gibbs(draws=150, warmup=50, chains=8, groups=2)
+    bmc.infer(ROBUST, DATA, engine=engine, rng=1, keep=["level", "scale"], executor=executor)
+
+
+def walk() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet("walk")
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 2.0))
+    dbn.add("y", lambda x: bmc.StudentT(4.0, x, 0.7))
+    return dbn
+
+
+def robust() -> bmc.BayesNet:
+    net = bmc.BayesNet("robust", plates={"i": 20_000})
+    net.add("level", bmc.Normal(0.0, 1.0))
+    net.add("scale", bmc.Gamma(2.0, 2.0))
+    net.add("y", lambda level, scale: bmc.StudentT(4.0, level, scale), plates="i")
+    return net
+
+
+WALK, ROBUST = walk(), robust()
+DATA = {"y": np.random.default_rng(3).standard_t(4, 20_000)}
+
+
+def many_questions() -> str:
+    """Process time for each evidence set of ALARM, all marginals read; of pyAgrum wall time of its own."""
+    net = bmc.io.read(network("alarm"))
+    sets = random_sets(net, SETS)
+    names = list(net)
+
+    def together() -> None:
+        posteriors = bmc.infer_many(net, sets)
+        for name in names:
+            posteriors.probabilities(name)
+
+    def loop() -> None:
+        for evidence in sets[:LOOPED]:
+            posterior = bmc.infer(net, evidence, engine=bmc.Exact())
+            for name in names:
+                posterior.probabilities(name)
+
+    times = {
+        "infer_many": 1e6 * spent(together) / SETS,
+        "a loop of infer": 1e6 * spent(loop) / LOOPED,
+    }
+    if peer_python() is not None:
+        with Peer("exact-pyagrum", network("alarm"), 0) as peer:
+            seconds = [peer.seconds(evidence) for evidence in sets[:ASKED]]
+        times["pyAgrum's loop"] = 1e6 * float(np.mean(seconds))
+    own = times["infer_many"]
+    rows = [[name, value, value / own] for name, value in times.items()]
+    title = f"ALARM, {SETS} evidence sets of 1 to 8 nodes, all marginals"
+    return table(title, ["what", "us each", "over infer_many"], rows)
+
+
+def random_sets(net: bmc.BayesNet, count: int) -> list[dict[str, str]]:
+    """Evidence drawn from the net, on nodes chosen at random."""
+    rng = np.random.default_rng(0)
+    names, drawn = list(net), net.sample(count, rng=1)
+    labels = {n: np.asarray(net[n].states)[np.asarray(drawn[n].codes)] for n in names}
+    found = []
+    for k in range(count):
+        seen = rng.choice(len(names), size=int(rng.integers(1, 9)), replace=False)
+        found.append({names[j]: str(labels[names[j]][k]) for j in seen})
+    return found
+
+
+def spent(run: Callable[[], None]) -> float:
+    run()
+    start = time.process_time()
+    run()
+    return time.process_time() - start
+
+
+def islands(runs: int) -> str:
+    """Means and variances of the evidence over the exact one: 2,048 particles in all, 40 rows."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.7))
+    drawn = dbn.unroll(40).sample(1, rng=0)
+    data = {"y": np.array([float(np.ravel(drawn[f"y[{t}]"])[0]) for t in range(40)])}
+    exact = bmc.filter(dbn, data, engine=bmc.KalmanFilter()).log_marginal_likelihood
+    rows: list[list[object]] = []
+    plain = None
+    for count in (1, 4, 16):
+        engine = bmc.IslandFilter(bmc.ParticleFilter(2048), islands=count)
+        found, exchanges, told = [], 0, []
+        for k in range(runs):
+            answer = bmc.filter(dbn, data, engine=engine, rng=k + 1_000_000 * count)
+            found.append(float(np.exp(answer.log_marginal_likelihood - exact)))
+            told.append(answer.log_marginal_likelihood_mcse)
+            exchanges += len(answer.exchanged) if count > 1 else 0
+        values = np.array(found)
+        plain = values.var() if plain is None else plain
+        off = (values.mean() - 1) / (values.std() / np.sqrt(runs))
+        sd = float(np.std(np.log(values)))
+        rows.append(
+            [count, values.mean(), off, values.var() / plain, exchanges / runs, sd, np.median(told)]
+        )
+    header = ["islands", "mean", "standard errors off 1", "variance over plain", "exchanges", "sd of log",
+              "stated"]  # fmt: skip
+    return table(f"evidence over the exact one, {runs} runs", header, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,151 @@
+"""Parameters by climbing: against closed forms, a dense Gaussian, and fixed points of EM."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesmc as bmc
+from bayesmc.errors import ConvergenceWarning, ModelError, UnsupportedError
+
+
+def counts() -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"day": 4})
+    net.add("rate", bmc.Gamma(2.0, 1.0))
+    net.add("count", lambda rate: bmc.Poisson(rate), plates="day")
+    return net
+
+
+def test_maxima_and_errors_are_the_closed_forms() -> None:
+    data = {"count": [3, 1, 4, 2]}
+    found = bmc.fit(counts(), data)
+    assert found.converged and found["rate"] == pytest.approx(2.5)
+    assert found.std_errors["rate"] == pytest.approx(np.sqrt(2.5 / 4), rel=1e-5)
+    assert found.log_likelihood == pytest.approx(stats.poisson(2.5).logpmf(data["count"]).sum())
+    mode = bmc.fit(counts(), data, prior=True)
+    assert mode["rate"] == pytest.approx((2 + 10 - 1) / (1 + 4))
+    assert mode["rate"] == pytest.approx(float(bmc.map(counts(), data)["rate"]), rel=1e-6)
+    assert mode.objective == pytest.approx(mode.log_likelihood + stats.gamma(2.0).logpdf(2.2))
+    assert found.net.do  # what was learned is fixed
+    assert bmc.infer(found.net, {}, engine=bmc.LikelihoodWeighting(10), rng=0)["rate"].std() == 0
+
+
+def walk() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("q", bmc.HalfNormal(5.0))
+    dbn.add_static("r", bmc.HalfNormal(5.0))
+    dbn.add("x", lambda x_prev, q: bmc.Normal(x_prev, q), initial=bmc.Normal(0.0, 3.0))
+    dbn.add("y", lambda x, r: bmc.Normal(x, r))
+    return dbn
+
+
+def walked(steps: int = 30) -> np.ndarray:
+    rng = np.random.default_rng(4)
+    return np.cumsum(0.7 * rng.normal(size=steps)) + 1.3 * rng.normal(size=steps)
+
+
+def test_a_local_level_is_the_maximum_of_the_dense_gaussian() -> None:
+    y = walked()
+    found = bmc.fit(walk(), {"y": y}, start={"q": 0.7, "r": 1.3})
+    at = np.minimum(*np.indices((len(y), len(y))))
+
+    def log_density(q: float, r: float) -> float:
+        cov = 9.0 + q**2 * at + r**2 * np.eye(len(y))
+        return float(stats.multivariate_normal(np.zeros(len(y)), cov).logpdf(y))
+
+    q, r = (float(found[n]) for n in ("q", "r"))
+    best = log_density(q, r)
+    assert found.log_likelihood == pytest.approx(best, abs=1e-8)
+    h = 1e-3
+    for dq, dr in ((h, 0.0), (-h, 0.0), (0.0, h), (0.0, -h)):
+        assert log_density(q + dq, r + dr) < best
+    corners = [log_density(q + a * h, r + b * h) for a, b in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
+    qr = (corners[0] - corners[1] - corners[2] + corners[3]) / (4 * h * h)
+    qq = (log_density(q + h, r) - 2 * best + log_density(q - h, r)) / h**2
+    rr = (log_density(q, r + h) - 2 * best + log_density(q, r - h)) / h**2
+    cov = np.linalg.inv(-np.array([[qq, qr], [qr, rr]]))
+    np.testing.assert_allclose(found.covariance, cov, rtol=0.01)
+    smoothed = bmc.smooth(found.net, {"y": y})  # a template whose static nodes are known
+    wanted = bmc.smooth(walk(), {"y": y, "q": q, "r": r})
+    np.testing.assert_allclose(smoothed.mean("x"), wanted.mean("x"))
+
+
+def test_labels_are_summed_out() -> None:
+    rng = np.random.default_rng(0)
+    z = rng.random(100) < 0.4
+    net = bmc.BayesNet(plates={"k": 2, "i": 100})
+    net.add("w", bmc.Dirichlet([1.0, 1.0]))
+    net.add("mu", bmc.Normal(0.0, 5.0), plates="k")
+    net.add("z", lambda w: bmc.Categorical(w), plates="i")
+    net.add("x", lambda z, mu: bmc.Normal(mu[z], 1.0), plates="i")
+    x = np.where(z, 3.0, -1.0) + rng.normal(size=100)
+    found = bmc.fit(net, {"x": x})
+    w, mu = found["w"], found["mu"]
+    mass = stats.norm(mu, 1.0).pdf(x[:, None]) * w
+    assert found.log_likelihood == pytest.approx(np.log(mass.sum(axis=1)).sum())
+    share = mass / mass.sum(axis=1, keepdims=True)  # a fixed point of EM
+    np.testing.assert_allclose(share.mean(axis=0), w, atol=1e-5)
+    np.testing.assert_allclose(share.T @ x / share.sum(axis=0), mu, atol=1e-4)
+
+
+@pytest.mark.thorough
+def test_hidden_numbers_are_integrated_out() -> None:
+    schools = bmc.BayesNet(plates={"s": 6})
+    schools.add("mu", bmc.Normal(0.0, 50.0))
+    schools.add("tau", bmc.HalfNormal(20.0))
+    schools.add("theta", lambda mu, tau: bmc.Normal(mu, tau), plates="s")
+    schools.add("y", lambda theta: bmc.Normal(theta, 2.0), plates="s")
+    y = np.array([28.0, 8.0, -3.0, 7.0, -1.0, 18.0])
+    effects = bmc.fit(schools, {"y": y})
+    assert effects["mu"] == pytest.approx(y.mean(), abs=1e-3)
+    assert effects["tau"] == pytest.approx(np.sqrt(y.var() - 4.0), rel=1e-4)
+
+
+@pytest.mark.thorough
+def test_numbers_at_an_edge_have_no_error() -> None:
+    rng = np.random.default_rng(1)
+    found = bmc.fit(walk(), {"y": rng.normal(size=60)}, start={"q": 0.3, "r": 1.0})
+    assert found["q"] < 1e-3 or found.converged  # no walk at all: the level stands still
+    summary = found.summary()
+    assert summary["r"]["se"] == pytest.approx(1.0 / np.sqrt(120), rel=0.3)
+
+
+def bad(net: Any, data: Any, **options: Any) -> Any:
+    return lambda: bmc.fit(net, data, **options)
+
+
+def test_what_cannot_be_learned_is_refused_in_words() -> None:
+    data = {"count": [1, 2, 3, 4]}
+    known = bmc.BayesNet()
+    known.add("y", lambda: bmc.Normal(0.0, 1.0))
+    mixed = walk()
+    mixed.table("s", ["s_prev"], [[0.9, 0.1], [0.1, 0.9]], initial=[0.5, 0.5])
+    for ask, error, says in (
+        (bad("net", data), ModelError, "expected a BayesNet"),
+        (bad(counts(), data, learn="rat"), ModelError, "did you mean 'rate'|no node"),
+        (bad(counts(), data, learn="count"), ModelError, "the data have it"),
+        (bad(counts(), data, start={"x": 1.0}), ModelError, "not learned"),
+        (bad(counts(), data, start={"rate": -1.0}), bmc.errors.EvidenceError, "support"),
+        (bad(counts(), data, engine=bmc.KalmanFilter()), UnsupportedError, "templates"),
+        (bad(known, {"y": 1.0}), ModelError, "nothing to learn"),
+        (
+            bad(walk(), {"y": walked()}, engine=bmc.ParticleFilter(10)),
+            UnsupportedError,
+            "random error",
+        ),
+        (bad(walk(), {"y": walked()}, learn=["q"]), UnsupportedError, "'r' is neither learned"),
+        (bad(walk(), {"y": walked()}, learn=["x", "q", "r"]), UnsupportedError, "every slice"),
+        (bad(mixed, {"y": walked()}), ModelError, 'learn="tables"'),
+    ):
+        with pytest.raises(error, match=says):
+            ask()
+
+
+def test_a_climb_cut_short_says_so() -> None:
+    with pytest.warns(ConvergenceWarning, match="before a maximum"):
+        start = {"q": 4.0, "r": 0.05}
+        found = bmc.fit(walk(), {"y": walked()}, start=start, max_iterations=1, tolerance=1e3)
+    assert not found.converged or len(found.history) < 4

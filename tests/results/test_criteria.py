@@ -1,0 +1,213 @@
+"""Pointwise likelihoods, leave-one-out, WAIC, comparisons, predictive checks: against ArviZ, by hand."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesmc as bmc
+from bayesmc.errors import LowEssWarning, PlateError, QueryError, UnsupportedError
+
+X = np.linspace(-1.0, 1.0, 12)
+Y = np.array([0.1, -0.5, 0.3, 0.2, 0.9, 0.4, 1.1, 0.6, 1.5, 1.2, 1.1, np.nan])
+
+
+def line(tail: Any = bmc.Normal) -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"day": None})
+    net.input("x", plates="day")
+    net.add("a", bmc.Normal(0.0, 3.0))
+    net.add("b", bmc.Normal(0.0, 3.0))
+    net.add("sd", bmc.HalfNormal(2.0))
+    net.add("y", lambda a, b, sd, x: tail(a + b * x, sd), plates="day")
+    return net
+
+
+def student(mean: Any, sd: Any) -> bmc.StudentT:
+    return bmc.StudentT(3.0, mean, sd)
+
+
+@cache
+def chains(tail: Any = bmc.Normal) -> bmc.Posterior:
+    engine = bmc.Gibbs(500, warmup=300)
+    return bmc.infer(line(tail), {"y": Y}, inputs={"x": X}, engine=engine, rng=0)
+
+
+def test_log_likelihoods_are_the_densities_at_the_draws() -> None:
+    posterior = chains()
+    found = posterior.log_likelihood()["y"]
+    mean = posterior["a"][..., None] + posterior["b"][..., None] * X
+    wanted = stats.norm(mean, posterior["sd"][..., None]).logpdf(np.nan_to_num(Y))
+    np.testing.assert_allclose(found[..., :-1], wanted[..., :-1])
+    assert np.isnan(found[..., -1]).all()
+    with pytest.raises(QueryError, match="not observed"):
+        posterior.log_likelihood("a")
+
+
+def test_criteria_are_arvizs_on_the_same_draws() -> None:
+    arviz_base = pytest.importorskip("arviz_base")
+    pytest.importorskip("xarray")
+    from arviz_stats import compare, loo
+
+    trees, ours = {}, {}
+    for name, tail in {"normal": bmc.Normal, "t": student}.items():
+        posterior = chains(tail)
+        log = posterior.log_likelihood()["y"][..., :-1]
+        own = {n: posterior[n] for n in ("a", "b", "sd")}
+        trees[name] = loo(
+            arviz_base.from_dict({"posterior": own, "log_likelihood": {"y": log}}), pointwise=True
+        )
+        ours[name] = posterior.loo()
+        assert ours[name].elpd == pytest.approx(trees[name].elpd, abs=1e-8)
+        assert ours[name].se == pytest.approx(trees[name].se, abs=1e-8)
+        assert ours[name].p == pytest.approx(trees[name].p, abs=1e-8)
+        np.testing.assert_allclose(ours[name].pareto_k, trees[name].pareto_k.values, atol=1e-8)
+        flat = log.reshape(-1, 11)  # Watanabe's formula as ArviZ has it
+        waic = (np.log(np.exp(flat).mean(axis=0)) - flat.var(axis=0)).sum()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LowEssWarning)
+            assert posterior.waic().elpd == pytest.approx(waic, abs=1e-8)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pandas' on ArviZ's own code
+        table, wanted = bmc.compare(ours), compare(trees)
+    assert list(table.names) == list(wanted.index)
+    for key in ("elpd", "se", "p", "elpd_diff", "dse"):
+        np.testing.assert_allclose(table[key], wanted[key], atol=1e-8)
+    np.testing.assert_allclose(table["weight"], wanted["weight"], atol=2e-3)
+
+
+def test_what_cannot_be_assessed_is_refused_in_words() -> None:
+    posterior = chains()
+    exact = bmc.BayesNet(plates={"day": 3})
+    exact.add("m", bmc.Normal(0.0, 1.0))
+    exact.add("y", lambda m: bmc.Normal(m, 1.0), plates="day")
+    seen = {"y": [0.0, 1.0, 2.0]}
+    with pytest.raises(UnsupportedError, match="resample"):
+        bmc.infer(exact, seen).loo()
+    weighted = bmc.infer(exact, seen, engine=bmc.LikelihoodWeighting(1000), rng=0)
+    with pytest.raises(UnsupportedError, match="weighted.*resample"):
+        weighted.loo()
+    assert weighted.resample(500, rng=0).loo().elpd < 0
+    with pytest.raises(QueryError, match="two models"):
+        bmc.compare({"one": posterior})
+    with pytest.raises(QueryError, match="observations"):
+        bmc.compare({"one": posterior, "other": weighted.resample(500, rng=0)})
+    with pytest.raises(QueryError, match="nothing was observed"):
+        bmc.prior_predict(exact, 10, rng=0).log_likelihood()
+
+
+def test_an_outlier_is_told_of() -> None:
+    net = bmc.BayesNet(plates={"day": 8})
+    net.add("m", bmc.Normal(0.0, 100.0))
+    net.add("y", lambda m: bmc.Normal(m, 1.0), plates="day")
+    posterior = bmc.infer(net, {"y": [0.1, 0.2, 0.3, 0.0, -0.2, 0.1, 0.0, 40.0]}).resample(
+        2000, rng=0
+    )
+    with pytest.warns(LowEssWarning, match="Pareto k"):
+        found = posterior.loo()
+    assert found.pareto_k is not None and found.pareto_k.argmax() == 7 and found.warning
+
+
+def test_predictions_bring_their_own_plates() -> None:
+    posterior = chains()
+    more = posterior.predict("y", inputs={"x": [0.0, 0.5, 2.0, 3.0]}, rng=0)
+    assert more["y"].shape == (4, 500, 4)
+    np.testing.assert_allclose(
+        more.mean("y"), posterior.mean("a") + posterior.mean("b") * [0, 0.5, 2, 3], atol=0.2
+    )
+    two = bmc.BayesNet(plates={"day": None})
+    for name in ("u", "v"):
+        two.input(name, plates="day")
+    two.add("m", bmc.Normal(0.0, 1.0))
+    two.add("y", lambda m, u, v: bmc.Normal(m * u + v, 1.0), plates="day")
+    known = {"u": np.ones(3), "v": np.zeros(3)}
+    found = bmc.infer(two, {"y": np.ones(3)}, inputs=known, engine=bmc.Gibbs(300, warmup=50), rng=0)
+    with pytest.raises(PlateError, match="4 and 3"):
+        found.predict("y", inputs={"u": np.ones(4), "v": np.ones(3)})
+
+
+def test_prior_predictions() -> None:
+    prior = bmc.prior_predict(line(), 4000, inputs={"x": [0.0, 1.0]}, rng=0)
+    assert prior["y"].shape == (1, 4000, 2)
+    assert prior.std("a") == pytest.approx(3.0, rel=0.06)  # five standard errors
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    assert bmc.prior_predict(dbn, 50, steps=4, rng=0)["x"].shape == (1, 50, 4)
+    with pytest.raises(bmc.errors.ModelError, match="steps="):
+        bmc.prior_predict(dbn, 50)
+    with pytest.raises(PlateError):
+        bmc.prior_predict(_sizeless(), 10)
+
+
+def _sizeless() -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"p": None})
+    net.add("y", bmc.Normal(0.0, 1.0), plates="p")
+    return net
+
+
+def test_predictive_checks_find_what_a_model_misses() -> None:
+    net = bmc.BayesNet(plates={"day": 30})
+    net.add("m", bmc.Normal(0.0, 10.0))
+    net.add("y", lambda m: bmc.Normal(m, 1.0), plates="day")
+    y = np.r_[np.random.default_rng(0).normal(size=29), 9.0]
+    check = bmc.infer(net, {"y": y}).predictive_check("y", rng=0)
+    assert check["max"]["p"] < 0.01 and 0.1 < check["mean"]["p"] < 0.9
+    assert check["max"]["observed"] == 9.0
+    with pytest.raises(UnsupportedError, match="one number"):
+        bmc.infer(net, {"y": y}).predictive_check("y", {"all": lambda v: v}, rng=0)
+
+
+MESQUITE = {
+    "log": ("d1", "d2", "canopy", "height", "density", "group"),
+    "logvolume": ("volume",),
+    "logva": ("volume", "area", "group"),
+    "logvas": ("volume", "area", "shape", "height", "density", "group"),
+    "logvash": ("volume", "area", "shape", "height", "group"),
+}
+
+
+def test_mesquite_bushes_are_ranked_as_known(reference_data: Path) -> None:
+    """By posteriordb's reference draws: logvash, logva, logvas and log within 0.6, logvolume 7.9 behind."""
+    path = reference_data / "posteriordb" / "data" / "mesquite.json"
+    if not path.exists():
+        pytest.skip("no mesquite.json in the data folder")
+    data = {k: np.asarray(v, dtype=float) for k, v in json.loads(path.read_text()).items()}
+    d1, d2, canopy = (np.log(data[k]) for k in ("diam1", "diam2", "canopy_height"))
+    column = {
+        "d1": d1, "d2": d2, "canopy": canopy, "height": np.log(data["total_height"]),
+        "density": np.log(data["density"]), "group": data["group"], "volume": d1 + d2 + canopy,
+        "area": d1 + d2, "shape": d1 - d2,
+    }  # fmt: skip
+    posteriors = {}
+    for name, chosen in MESQUITE.items():
+        design = np.stack([np.ones(46), *(column[c] for c in chosen)], axis=-1)
+        net = bmc.BayesNet(name, plates={"bush": 46})
+        wide = np.full(design.shape[1], 1e3)
+        net.add("beta", bmc.MvNormal(np.zeros(len(wide)), scale_diag=wide))
+        net.add("sigma", bmc.HalfCauchy(100.0))
+        net.add(
+            "y",
+            lambda beta, sigma, at=design: bmc.Normal(np.vecdot(at, beta), sigma),
+            plates="bush",
+        )
+        engine = bmc.Gibbs(1000, warmup=500)
+        posteriors[name] = bmc.infer(net, {"y": np.log(data["weight"])}, engine=engine, rng=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LowEssWarning)
+        table = bmc.compare(posteriors)
+    assert table.names[:2] == ("logvash", "logva") and table.names[-1] == "logvolume"
+    known = {
+        "log": -19.38,
+        "logvolume": -26.73,
+        "logva": -19.03,
+        "logvas": -19.37,
+        "logvash": -18.85,
+    }
+    for name, elpd in known.items():
+        assert table[name]["elpd"] == pytest.approx(elpd, abs=0.4)
