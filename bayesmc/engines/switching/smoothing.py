@@ -135,7 +135,7 @@ def warn_where_lost(
         "filtered one; rows are missing there, over which Kim's smoother loses which modes went with which "
         f"numbers, and its answers about slices before and in such gaps are too wide: use {others}",
         EngineWarning,
-        stacklevel=5,
+        stacklevel=6,
     )
 
 
