@@ -12,12 +12,13 @@ from bayesmc.auto.switching import REASON, why_too_long, within_budget
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import asking, is_worth_it
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.propagation.engine import ExpectationPropagation
+from bayesmc.engines.refusals import common_refusal
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
 

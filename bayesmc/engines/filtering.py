@@ -26,6 +26,7 @@ from bayesmc.dbn import (
 )
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
+from bayesmc.engines.refusals import common_refusal
 from bayesmc.errors import (
     BayesmcError,
     InterruptWarning,
@@ -301,20 +302,6 @@ class FilterEngine:
             f"{type(self).__name__} does not {what}; use engine=None, which finds one that does where "
             "there is one, or ask a static engine on dbn.unroll(steps)"
         )
-
-
-def common_refusal(engine: FilterEngine | str, problem: SeriesProblem) -> str | None:
-    """What no engine over time takes: static nodes whose value is not known."""
-    if not problem.unknown_static:
-        return None
-    names = ", ".join(map(repr, problem.unknown_static))
-    known = "infers static nodes" if isinstance(engine, str) else "takes static nodes as known"
-    who = engine if isinstance(engine, str) else type(engine).__name__
-    return (
-        f"{who} {known}, and {names} is not observed; observe it (its value in observations=), or infer it "
-        "with the trajectory: infer(dbn, observations), by itself or with engine=ParticleGibbs(draws), "
-        "ParticleMetropolis(draws) or another static engine"
-    )
 
 
 def pass_slices(

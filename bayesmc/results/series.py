@@ -355,6 +355,12 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
             raise UnknownNodeError(
                 f"there is no node {name!r}{did_you_mean(name, self.names)}; answered are {list(self.names)}"
             )
+        if node.is_object:
+            raise QueryError(
+                f"{name!r} holds objects, which have no mean, variance or probabilities; give "
+                "queries={name: function} that makes numbers of them, or go by start and step, where "
+                f"belief.particles({name!r}) hands them out"
+            )
         if name not in self._tables and name not in self._means:
             raise UnsupportedError(
                 f"{name!r} is not answered for by this result (answered are {list(self.names)}); inputs and "

@@ -190,7 +190,7 @@ class ParticleBelief(OnlineBelief):
         """
         if callable(what):
             return self._answers.mcse(what)[0]
-        node, block = self._node(what), self._block
+        node, block = self._numbers(what), self._block
         assert self.families is not None
         return node_errors(ByFamily(block, [self.families]), block, node)[0]
 
@@ -202,14 +202,14 @@ class ParticleBelief(OnlineBelief):
 
     def mean(self, name: str) -> np.ndarray:
         """Mean, shape ``(*plates, *event)``; circular for angles."""
-        node = self._node(name)
+        node = self._numbers(name)
         if node.domain is None:
             return self._block.mean(node)[0]
         return self._block.table(node)[0] @ numbers_of_states(node)
 
     def var(self, name: str) -> np.ndarray:
         """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
-        node = self._node(name)
+        node = self._numbers(name)
         if node.domain is None:
             return self._block.mean_and_variance(node)[1][0]
         return table_variance(self._block.table(node)[0], numbers_of_states(node, "variance"))
@@ -222,7 +222,7 @@ class ParticleBelief(OnlineBelief):
         """Probabilities of the states of a finite node, shape ``(*plates, states)``; of one at a time."""
         if others:
             raise no_joint_table((name, *others), "ask", "expectation(%s)")
-        node = self._node(name)
+        node = self._numbers(name)
         if node.domain is None:
             raise QueryError(
                 f"probabilities({name!r}): the node has no finite set of states; use mean, var or expectation"
@@ -239,11 +239,11 @@ class ParticleBelief(OnlineBelief):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(*q.shape, *plates, *event)``; those of angles are cut opposite the mean."""
-        return self._answers.quantile(self._node(name).name, q)[0]
+        return self._answers.quantile(self._numbers(name).name, q)[0]
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrix of all numbers of the named nodes, in order; of one number, its variance."""
-        return self._answers.cov(*(self._node(name).name for name in names))[0]
+        return self._answers.cov(*(self._numbers(name).name for name in names))[0]
 
     def __repr__(self) -> str:
         if self.now is None:
@@ -285,6 +285,16 @@ class ParticleBelief(OnlineBelief):
     def _step(self) -> FilterStep | Bare:
         assert self.made_by is not None
         return self.made_by
+
+    def _numbers(self, name: str) -> CompiledNode:
+        """A node that has numbers, or states."""
+        node = self._node(name)
+        if node.is_object:
+            raise QueryError(
+                f"{name!r} holds objects, which have no mean, variance, quantiles or probabilities; see "
+                f"particles({name!r}), or ask for the expectation of a function that makes numbers of them"
+            )
+        return node
 
     def _node(self, name: str) -> CompiledNode:
         now = self._particles

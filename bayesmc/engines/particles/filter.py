@@ -45,6 +45,7 @@ from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
 from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.runs import run_of
 from bayesmc.engines.particles.smoothing import Backwards, backwards
+from bayesmc.engines.refusals import check_keep, no_past_of_objects, not_with_objects
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.randomness import seed_sequence
@@ -231,7 +232,7 @@ class ParticleFilter(FilterEngine):
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         require_functions(self, _FUNCTIONS)
-        common = super().refusal(problem)
+        common = super().refusal(problem) or not_with_objects(self, problem)
         if common is not None:
             return common
         asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
@@ -241,8 +242,10 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if why := not_delayed(self.delay, asked) or marginal.not_of_the_past(
-            self, problem, asked.what
+        if why := (
+            no_past_of_objects(problem, asked.what, asked.keep, self.delay)
+            or not_delayed(self.delay, asked)
+            or marginal.not_of_the_past(self, problem, asked.what)
         ):
             return why
         sums = marginal.endless_sums(self, problem) if asked.what == "smooth" else ()
@@ -277,10 +280,7 @@ class ParticleFilter(FilterEngine):
         progress: bool | None = None,
         checkpoint: RunFile | None = None,
     ) -> FilteredParticles:
-        if keep not in (None, "particles"):
-            raise ValueError(
-                f'keep={keep!r}: give "particles", or None for answers of constant size'
-            )
+        check_keep(problem, keep, self.delay)
         if not self._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
