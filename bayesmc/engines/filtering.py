@@ -15,18 +15,24 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
+from bayesmc.dbn import (
+    DynamicBayesNet,
+    Row,
+    SeriesProblem,
+    Slices,
+    given_static,
+    pose_series,
+    read_row,
+)
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
 from bayesmc.engines.refusals import common_refusal
 from bayesmc.errors import (
     BayesmcError,
-    EvidenceError,
     InterruptWarning,
     ModelError,
     QueryError,
     UnsupportedError,
-    did_you_mean,
 )
 from bayesmc.results import SeriesPosterior
 
@@ -209,15 +215,7 @@ class FilterEngine:
         dbn.validate()
         if belief is not None:
             return self._resumed(dbn, belief, static, rng)
-        given = dict(static or {})
-        known = dbn.template.static
-        for name in given:
-            if name not in known:
-                raise EvidenceError(
-                    f"static= gives {name!r}, which is no static node{did_you_mean(name, known)}; there are "
-                    f"{list(known)}"
-                )
-        return self._nothing(dbn.copy(), given, rng)
+        return self._nothing(dbn.copy(), given_static(dbn.template, static), rng)
 
     def step(
         self,

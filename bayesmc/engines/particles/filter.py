@@ -28,6 +28,7 @@ from bayesmc.engines.particles.options import (
     check_count,
     check_kind,
     check_numbers,
+    check_parts,
     check_together,
     described,
     looks_told,
@@ -83,7 +84,7 @@ class ParticleFilter(FilterEngine):
         where it names what is missing (an observation, or the slice before slice 0): there the node's own
         density is drawn from. A detector mixed with the transition is a ``Mixture`` of both. ``"optimal"``
         derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
-        is seen is affine in them; else what is seen is made linear, or its log density quadratic, at each
+        is seen is affine in them; else what is seen is linearised, or its log density quadratic, at each
         particle, mixtures of Gaussians component by component, and a tenth of the particles is drawn from
         their own densities. Hidden finite nodes are drawn from their own densities; ``explain`` says what
         guides each node, and why any is not guided. With any proposal vectors are seen whole or not at all.
@@ -373,6 +374,7 @@ class ParticleFilter(FilterEngine):
         return bound(self._sized(START), belief, dbn, slices)
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
+        check_parts(self, row.seen)
         if self.marginalize is None and not isinstance(belief.made_by, FilterStep):
             warn_of_what_is_not_guided(self, slices, row.seen)
         found = absorbed(self._sized(START), belief, slices, row)
