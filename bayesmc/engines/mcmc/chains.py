@@ -26,7 +26,6 @@ from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_gro
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
-from bayesmc.engines.mcmc.patience import Patience
 from bayesmc.engines.mcmc.question import difference
 from bayesmc.engines.mcmc.saved import SavedChains, answer_so_far
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
@@ -38,7 +37,7 @@ from bayesmc.errors import (
     UnsupportedError,
 )
 from bayesmc.network import Problem
-from bayesmc.progress import Progress
+from bayesmc.progress import Patience, Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunFile, RunningChains
 

@@ -14,10 +14,9 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.patience import Patience
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
-from bayesmc.progress import Progress
+from bayesmc.progress import Patience, Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
 
 #: the first sweep at which a warmup may end where that is judged
