@@ -1,4 +1,4 @@
-"""A progress bar for what takes more than a second, for which tqdm is imported only then; Ctrl-C that waits."""
+"""A progress bar for what takes more than a second (tqdm is imported only then); Ctrl-C that waits."""
 
 from __future__ import annotations
 
