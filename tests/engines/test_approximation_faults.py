@@ -196,6 +196,36 @@ def test_noise_too_small_to_tell_is_named() -> None:
             bmc.infer(net, {"y": 1.5}, engine=engine)
 
 
+@pytest.mark.parametrize("far", [1e7, 1e9])
+def test_evidence_does_not_depend_on_where_numbers_are_counted_from(far: float) -> None:
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("a", bmc.Normal(far, 100.0))
+    net.add("y", lambda a: bmc.Normal(a, 1.0), plates="i")
+    posterior = bmc.infer(net, {"y": far + np.array([4.0, 5.0, 6.0])}, engine=EP())
+    assert abs(posterior.log_marginal_likelihood + 8.912558554659775) < 1e-8
+    assert abs(posterior.mean("a") - far - 4.999833338888704) < 1e-6
+    assert abs(posterior["a"].mean() - far - 5.0) < 0.1
+
+
+def test_factors_move_along_with_where_numbers_are_counted_from() -> None:
+    """A probit, quadrature, a comparison and a mixture: what is told does not depend on the place."""
+    found = []
+    for far in (0.0, 4.5e6):
+        net = bmc.BayesNet(plates={"i": 3})
+        net.add("x", bmc.StudentT(4.0, far, 10.0))
+        net.add("b", bmc.Normal(0.0, 0.1))
+        net.add("z", bmc.Bernoulli(0.4))
+        net.add("y", lambda x, b, z: bmc.Normal(x + b + 2.0 * z, 0.5), plates="i")
+        net.add("p", lambda x, far=far: bmc.Bernoulli(special.ndtr(x - far)))
+        net.add("q", lambda x, far=far: bmc.Bernoulli(special.expit(x - far - 1.0)))
+        net.add("c", lambda x, b, far=far: bmc.Bernoulli(x > far + 10.0 * b))
+        seen = {"y": far + np.array([1.0, 1.5, 0.5]), "p": 1, "q": 0, "c": 1}
+        posterior = bmc.infer(net, seen, engine=EP())
+        moments = [posterior.mean("x") - far, posterior.std("x"), posterior.mean("z")]
+        found.append([posterior.log_marginal_likelihood, *moments])
+    np.testing.assert_allclose(*found, atol=1e-7)
+
+
 # ---- signatures ---------------------------------------------------------------------------------
 
 
