@@ -283,6 +283,7 @@ def test_what_was_seen_and_what_is_next_to_certain_has_not_moved() -> None:
             check = bmc.infer(net, seen, engine=engine, rng=0).check(rng=0)
             assert check.ok and check.moved < 0.1 and len(check._rows) == rows
             assert "plain answers are near" in str(check)
+            assert "regions that the approximation never reaches" in str(check)
 
 
 # ---- signatures ---------------------------------------------------------------------------------

@@ -134,13 +134,13 @@ class Check:
         words = "right within their errors"
         if not own < self.bound:
             words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
-        elif not self.k < self.bound:
-            words += ", if nothing lies where no draw went"
         lines = [
             f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
             f"own coordinates (made in {self.approximation.coordinates})",
             f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {self._plain_words()}",
             f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
+            "neither k nor the errors tell of regions that the approximation never reaches: other modes, "
+            "states with numbers far off",
         ]
         plain = self.approximate.log_marginal_likelihood
         if plain is not None:

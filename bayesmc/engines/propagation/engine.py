@@ -157,8 +157,8 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
             return (
                 f"ExpectationPropagation: beliefs rest after {end.sweeps} sweeps, but {end.open} factors "
                 "have no integral with what the others say, and their messages were left as they were: the "
-                "answer is none of all factors, and the posterior may have no integral (a scale whose readings are "
-                "all equal); take Gibbs, or a prior that keeps scales from 0"
+                "answer is none of all factors, and the posterior may have no integral (a scale whose "
+                "readings are all equal); take Gibbs, or a prior that keeps scales from 0"
             )
         return (
             f"ExpectationPropagation: messages have not settled after {end.sweeps} sweeps: the last one "
