@@ -83,6 +83,7 @@ from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.engines.weighted.rejection import Rejection
 from bayesmc.learning import Fit, fit
 from bayesmc.network import BayesNet, FactorGraph
+from bayesmc.objects import FrozenObject
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Elpd, Marginal, Posterior, SeriesPosterior, Summary, compare
@@ -120,6 +121,7 @@ __all__ = [
     "FactorGraph",
     "FactoredFrontier",
     "Fit",
+    "FrozenObject",
     "Gamma",
     "Geometric",
     "GridFilter",

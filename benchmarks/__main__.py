@@ -15,6 +15,7 @@ from benchmarks import (
     bench_robot_logs,
     bench_robots,
     bench_scale,
+    bench_slam,
     bench_switching,
     bench_time,
     bench_vision,
@@ -55,5 +56,7 @@ if __name__ == "__main__":
         bench_fading.main()
         print()
         bench_robot_logs.main()
+        print()
+        bench_slam.main(())
         print()
         bench_vision.main()

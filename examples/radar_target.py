@@ -7,7 +7,7 @@
 
 Who answers, and what each of them approximates:
 
-- ``SwitchingKalmanFilter`` (GPB1, IMM, GPB2) keeps one Gaussian for each mode, whose readings are made linear
+- ``SwitchingKalmanFilter`` (GPB1, IMM, GPB2) keeps one Gaussian for each mode, whose readings are linearised
   where it stands (``linearize=True``), and merges; its smoother is Kim's;
 - ``ExpectationPropagation``, smoothed, passes messages between these Gaussians until they agree;
 - an extended Kalman filter takes the target to fly straight on, pushed about by more noise;

@@ -33,7 +33,7 @@ from tests.matrix import DOUBTS, SHIFT
 
 #: "static": a static node is unknown, which particle chains alone answer; "one number": linear ones of which
 #: the default grid finds its range and cells; "switching": linear ones with modes that make no difference to
-#: numbers, so that filters that merge Gaussians are exact "modes": with ones that do
+#: numbers, so that filters that merge Gaussians are exact; "modes": with ones that do
 KINDS = ("finite", "linear", "static", "one number", "switching", "modes")
 #: templates of each kind for engines that compute, and for those with particles, which take longer
 MANY, FEW = session.scaled(5, 8), session.scaled(2, 15)
@@ -107,7 +107,7 @@ COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
     "SwitchingKalmanFilter": (bmc.SwitchingKalmanFilter(), 1e-7, ("linear", "switching")),
     "SwitchingKalmanFilter, IMM": (bmc.SwitchingKalmanFilter("imm"), 1e-7, ("switching",)),
     "SwitchingKalmanFilter, GPB1": (bmc.SwitchingKalmanFilter("gpb1"), 1e-7, ("switching",)),
-    "SwitchingKalmanFilter, made linear": (
+    "SwitchingKalmanFilter, linearised": (
         bmc.SwitchingKalmanFilter(linearize=True),
         1e-6,
         ("switching",),
@@ -180,14 +180,49 @@ def tabled(case: Series, seed: int) -> bmc.ParticleFilter | None:
     return None
 
 
+def bent(seed: int) -> tuple[Series, bmc.DynamicBayesNet, tuple[str, ...]] | None:
+    """A case with modes, its template with means that do not look affine, and what "auto" integrates out.
+
+    Tangents of these are the functions themselves, so that linearised nodes have exact answers.
+    """
+    case = series("modes", seed)
+    if case is None:
+        return None
+    problem = pose_series(case.dbn, case.observations, case.inputs)
+    split = split_of_problem(bmc.ParticleFilter(50, marginalize="auto"), problem)
+    if split is None or not split.inner:
+        return None
+    other = random_switching_dbn(seed, mean=lambda x: np.log(np.exp(x)))
+    return case, other.dbn, split.inner
+
+
+def late(case: Series, found: SeriesPosterior, lag: int) -> dict[str, tuple[Any, Any]]:
+    """Figures of every slice given rows up to so many slices later, answered and exact, by name."""
+    names = [n for n in found.names if hidden(case, n)]
+    finite = {n: found.model[n].domain is not None for n in names}
+    right: dict[str, Any] = {n: [] for n in names}
+    static = case.dbn.static_nodes
+    for t in range(case.exact.steps):
+        rows = {n: v if n in static else v[: t + lag + 1] for n, v in case.observations.items()}
+        inputs = {n: v[: t + lag + 1] for n, v in (case.inputs or {}).items()}
+        answer = exact(case.dbn, rows, inputs or None)
+        for name in names:
+            right[name].append(figure(answer, name, finite[name])[t])
+    return {n: (figure(found, n, finite[n]), np.stack(right[n])) for n in names}
+
+
 def unbiased(case: Series, engine: bmc.ParticleFilter) -> tuple[Callable[[Any], Any], Any]:
     """Estimates without bias, of any number of particles, and what they estimate.
 
-    They are figures times estimated over exact evidence: filtered ones of the last slice, and smoothed ones
-    of the first where the engine smooths (Del Moral 2004, Feynman-Kac formulae, sec. 7.4.2; Del Moral,
-    Doucet and Singh 2010, A backward particle interpretation of Feynman-Kac formulae, M2AN 44).
+    They are figures times estimated over exact evidence: filtered ones of the last slice, those of the slice
+    before one row late, and smoothed ones of the first where the engine smooths (Del Moral 2004, Feynman-Kac
+    formulae, sec. 7.4.2; Del Moral, Doucet and Singh 2010, A backward particle interpretation of Feynman-Kac
+    formulae, M2AN 44).
     """
-    questions = {"filter": (bmc.filter, case.exact.steps - 1), "smooth": (bmc.smooth, 0)}
+    last = case.exact.steps - 1
+    questions: dict[str, Any] = {"filter": (bmc.filter, last), "smooth": (bmc.smooth, 0)}
+    if last > 0 and engine.delay is None:  # one row late: what is said of the slice before the last
+        questions["late"] = (functools.partial(bmc.smooth, lag=1), last - 1)
     log_exact = case.exact.log_marginal_likelihood - case.exact.log_static
 
     def ask(what: str, rng: Any) -> SeriesPosterior | None:

@@ -41,7 +41,7 @@ expression
 linalg
 resampling | gaussian | diagnostics | markov | plates | states | randomness | progress | storage
 categorical
-errors | shapes
+errors | shapes | objects
 """
 DEPTH = {
     room.strip(): depth

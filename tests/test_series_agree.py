@@ -8,6 +8,7 @@ of 1e-4 (Holm over its figures); an ordinary run has some 40 of them, at fixed s
 
 from __future__ import annotations
 
+import itertools
 import warnings
 from dataclasses import replace
 from typing import Any
@@ -40,10 +41,13 @@ from tests.matrix_time import (
     MARGINAL,
     PARTICLES,
     RUNS,
+    SHIFT,
     TRIED,
     answered,
+    bent,
     cases,
     hidden,
+    late,
     stated,
     tabled,
     unbiased,
@@ -68,6 +72,25 @@ def test_filters_and_smoothers_match_exact_answers(engine: str) -> None:
             filtered = bmc.filter(case.dbn, case.observations, **given)
             found = compare(filtered, case.exact, ALPHA, rtol=rtol)
             assert found, (case.dbn, found)
+
+
+@pytest.mark.parametrize("engine", COMPUTING)
+def test_late_answers_match_exact_ones(engine: str) -> None:
+    """Every slice given the rows up to one after it (``lag=1``); there is no chance in it."""
+    engine_used, rtol, kinds = COMPUTING[engine]
+    asked = 0
+    for kind in kinds:
+        for _, case in cases(kind, session.scaled(1, 20)):
+            given: dict[str, Any] = {"inputs": case.inputs, "engine": engine_used, "lag": 1}
+            try:
+                found = bmc.smooth(case.dbn, case.observations, **given)
+            except UnsupportedError:
+                continue
+            for answer, right in late(case, found, 1).values():
+                scale = max(float(np.abs(right).max()), 1.0)
+                np.testing.assert_allclose(answer, right, rtol=rtol, atol=rtol * scale)
+                asked += 1
+    assert asked or engine == "ExpectationPropagation"  # which says that it has no lags
 
 
 @pytest.mark.parametrize("engine", COMPUTING)
@@ -139,6 +162,33 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
         assert found, (case.dbn, found)
         tried += 1
     assert tried
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ModelMisfitWarning")
+def test_linearised_nodes_are_exact_where_tangents_are() -> None:
+    """Filtered, and one row late by ``lag=`` and ``delay=``, as where means are known to be affine, at equal
+    seeds: there is no chance in it."""
+    found = (bent(seed) for seed in range(SHIFT, SHIFT + 100))
+    for case, dbn, names in itertools.islice((f for f in found if f is not None), 2 * FEW):
+        engine = bmc.ParticleFilter(40, marginalize=names)
+        given: dict[str, Any] = {"inputs": case.inputs, "rng": 3}
+        told = bmc.explain(dbn, case.observations, inputs=case.inputs, engine=engine).nodes
+        assert any("linearised" in text for text in told.values())
+        for ask, other, more in (
+            (bmc.filter, engine, {}),
+            (bmc.filter, replace(engine, delay=1), {}),
+            (bmc.smooth, engine, {"lag": 1}),
+        ):
+            plain, own = (
+                ask(d, case.observations, engine=other, **given, **more) for d in (case.dbn, dbn)
+            )
+            for name in names:
+                np.testing.assert_allclose(own.mean(name), plain.mean(name), rtol=1e-7, atol=1e-9)
+                np.testing.assert_allclose(own.var(name), plain.var(name), rtol=1e-7, atol=1e-9)
+            np.testing.assert_allclose(
+                own.log_marginal_likelihood, plain.log_marginal_likelihood, rtol=1e-9
+            )
 
 
 def test_particle_filters_with_tables_have_no_bias() -> None:

@@ -11,13 +11,14 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.switching import REASON, why_too_long, within_budget
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.factored.filter import BoyenKoller
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
+from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import asking, is_worth_it
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.propagation.engine import ExpectationPropagation
+from bayesmc.engines.refusals import common_refusal
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import EngineWarning, UnsupportedError
 
@@ -112,6 +113,14 @@ def engine_for(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked
         return engine  # what else it cannot do, its own method says best
     others = [c() for c in _CANDIDATES if not isinstance(engine, c)]
     able = next((type(o).__name__ for o in others if _why_not(o, problem, asked) is None), None)
+    unable = [
+        f"{type(o).__name__}()"
+        for o in (*others, FactoredFrontier())
+        if f"{type(o).__name__}(" in reason and type(o) is not type(engine)
+        if _why_not(o, problem, asked) is not None
+    ]
+    if unable:
+        reason = f"{reason} (of these {' and '.join(unable)} cannot answer here, either)"
     if able is None or re.search(rf"\buse [^.;]*\b{able}\b", reason):  # which says it already
         raise UnsupportedError(reason)
     raise UnsupportedError(f"{reason}. {able}() can answer")

@@ -308,7 +308,7 @@ def _smoothed(
             f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
         )
     if engine is None and isinstance(chosen, ExpectationPropagation):
-        return settled_or_kim(chosen, problem, seed, queries, options["progress"])
+        return settled_or_kim(chosen, problem, queries, options["progress"])
     given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
     return chosen.smooth(problem, seed, **given)
 

@@ -11,7 +11,7 @@ import warnings
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.filtering import Queries
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
 from bayesmc.errors import ConvergenceWarning, EngineWarning, UnsupportedError
@@ -52,7 +52,6 @@ def why_too_long(engine: ExpectationPropagation, problem: SeriesProblem) -> str 
 def settled_or_kim(
     engine: ExpectationPropagation,
     problem: SeriesProblem,
-    seed: np.random.SeedSequence,
     queries: Queries | None,
     progress: bool | None,
 ) -> SeriesPosterior:
@@ -85,5 +84,6 @@ def settled_or_kim(
         EngineWarning,
         stacklevel=3,
     )
-    kim: FilterEngine = SwitchingKalmanFilter()
-    return kim.smooth(problem, seed, queries=queries, progress=progress)
+    others = "ParticleFilter(particles)"  # messages have just failed
+    kim = SwitchingKalmanFilter()
+    return kim.smoothed(problem, others, queries=queries, progress=progress)

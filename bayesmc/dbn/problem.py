@@ -55,8 +55,14 @@ class SeriesProblem:
 
     @cached_property
     def hidden(self) -> tuple[str, ...]:
-        """Nodes of a slice that are not observed in full throughout, parents first."""
-        return tuple(n for n in self.slices.dynamic if n not in self.seen)
+        """Nodes of a slice that are not observed in full throughout, parents first; objects apart."""
+        apart = {*self.seen, *self.objects}
+        return tuple(n for n in self.slices.dynamic if n not in apart)
+
+    @cached_property
+    def objects(self) -> tuple[str, ...]:
+        """Nodes of a slice whose values are objects."""
+        return tuple(n for n in self.slices.dynamic if self.model[n].is_object)
 
     @property
     def known_static(self) -> dict[str, np.ndarray]:

@@ -212,12 +212,18 @@ def read_row(
         for n, v in (observations or {}).items()
         if v is not None
     }
-    given = {n: [_by_label(template, n, v)] for n, v in (inputs or {}).items()}
+    given = {n: [_by_label(template, n, v)] for n, v in (inputs or {}).items() if v is not None}
+    for name in rows:
+        _check_observed(template, name)
+        if name in template.static:
+            raise EvidenceError(
+                f"observations of {name!r} in one slice, and that node is static; give its value once, "
+                f"start(dbn, static={{{name!r}: value}})"
+            )
+    _check_inputs(template, slices, rows, given)
     if slices is None:
         slices, series = read_series(dbn, rows, given, steps=1)
     else:
-        for name in rows:
-            _check_observed(template, name)
         sizes = slices.later.sizes
         values = read_input_rows(template, sizes, given, 1)
         seen = {n: _observed(slices.later[n], _rows(template, n, v), 1) for n, v in rows.items()}
@@ -228,35 +234,6 @@ def read_row(
         row.inputs[TIME + PREVIOUS] = np.asarray(t - 1)
         row.inputs.update({n + PREVIOUS: v for n, v in before.items()})
     return slices, Row(t, row.seen, row.inputs)
-
-
-def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Stored values of static nodes, all of which must be given.
-
-    Raises
-    ------
-    EvidenceError
-    """
-    found = {}
-    for name in slices.template.static:
-        node = slices.first[name]
-        if not node.is_stochastic:
-            continue
-        given = values.get(name)
-        labelled = by_label(f"static {name!r}", given, node.plates, slices.first.labels)
-        seen = observe(node, labelled) if given is not None else None
-        if seen is None or seen.mask is not None:
-            raise EvidenceError(
-                f"static node {name!r} has no value; pass static={{{name!r}: value}}"
-            )
-        found[name] = seen.value
-    for name in values:
-        if name not in found:
-            raise EvidenceError(
-                f"static= gives {name!r}, which is no static node with a density"
-                f"{did_you_mean(name, found)}; there are {list(found)}"
-            )
-    return found
 
 
 def read_input_rows(
@@ -337,6 +314,21 @@ def unrolled(template: Template, observations: Mapping[str, Any]) -> dict[str, A
 def _in_time(value: Any) -> Any:
     """One row as a series of one."""
     return value[None] if isinstance(value, (np.ndarray, np.ma.MaskedArray)) else [value]
+
+
+def _check_inputs(
+    template: Template, slices: Slices | None, rows: Mapping[str, Any], given: Mapping[str, Any]
+) -> None:
+    """Refuse inputs of one slice that are missing or of another shape; the axis for time is ours."""
+    missing = [n for n in template.inputs if n not in given]
+    if missing:
+        raise EvidenceError(
+            f"input {missing[0]!r} has no value in this slice; give step(..., inputs={{{missing[0]!r}: "
+            "value}), also where observations are missing"
+        )
+    sizes = sizes_of(template, {**rows, **given}) if slices is None else slices.later.sizes
+    for name in template.inputs:
+        checked_input(template.later[name], given[name][0], sizes)
 
 
 def _check_observed(template: Template, name: str) -> None:

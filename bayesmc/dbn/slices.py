@@ -439,6 +439,7 @@ def _face(node: CompiledNode) -> list[tuple[Any, str]]:
         (node.is_stochastic, chance),
         (node.event_shape, f"values of shape {node.event_shape}"),
         ((states, node.is_discrete), f"values on {_on(node)}"),
+        (node.is_object, "objects" if node.is_object else "numbers"),
     ]
 
 

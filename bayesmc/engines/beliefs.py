@@ -18,6 +18,7 @@ from bayesmc.errors import ModelError, QueryError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results import SeriesPosterior, save
 from bayesmc.results.marginal_answers import MarginalAnswers
+from bayesmc.results.series import no_joint_table
 
 
 class OnlineBelief:
@@ -172,8 +173,10 @@ class SliceBelief(OnlineBelief):
         """Standard deviation, shape ``(*plates, *event)``."""
         return self._posterior.std(name)[0]
 
-    def probabilities(self, name: str) -> np.ndarray:
-        """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
+    def probabilities(self, name: str, *others: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(*plates, states)``; of one at a time."""
+        if others:
+            raise no_joint_table((name, *others), "ask", "expectation(%s)")
         return self._posterior.probabilities(name)[0]
 
     def quantile(self, name: str, q: Any) -> np.ndarray:

@@ -15,17 +15,24 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
+from bayesmc.dbn import (
+    DynamicBayesNet,
+    Row,
+    SeriesProblem,
+    Slices,
+    given_static,
+    pose_series,
+    read_row,
+)
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
+from bayesmc.engines.refusals import common_refusal
 from bayesmc.errors import (
     BayesmcError,
-    EvidenceError,
     InterruptWarning,
     ModelError,
     QueryError,
     UnsupportedError,
-    did_you_mean,
 )
 from bayesmc.results import SeriesPosterior
 
@@ -208,15 +215,7 @@ class FilterEngine:
         dbn.validate()
         if belief is not None:
             return self._resumed(dbn, belief, static, rng)
-        given = dict(static or {})
-        known = dbn.template.static
-        for name in given:
-            if name not in known:
-                raise EvidenceError(
-                    f"static= gives {name!r}, which is no static node{did_you_mean(name, known)}; there are "
-                    f"{list(known)}"
-                )
-        return self._nothing(dbn.copy(), given, rng)
+        return self._nothing(dbn.copy(), given_static(dbn.template, static), rng)
 
     def step(
         self,
@@ -303,20 +302,6 @@ class FilterEngine:
             f"{type(self).__name__} does not {what}; use engine=None, which finds one that does where "
             "there is one, or ask a static engine on dbn.unroll(steps)"
         )
-
-
-def common_refusal(engine: FilterEngine | str, problem: SeriesProblem) -> str | None:
-    """What no engine over time takes: static nodes whose value is not known."""
-    if not problem.unknown_static:
-        return None
-    names = ", ".join(map(repr, problem.unknown_static))
-    known = "infers static nodes" if isinstance(engine, str) else "takes static nodes as known"
-    who = engine if isinstance(engine, str) else type(engine).__name__
-    return (
-        f"{who} {known}, and {names} is not observed; observe it (its value in observations=), or infer it "
-        "with the trajectory: infer(dbn, observations), by itself or with engine=ParticleGibbs(draws), "
-        "ParticleMetropolis(draws) or another static engine"
-    )
 
 
 def pass_slices(

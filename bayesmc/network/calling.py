@@ -20,6 +20,7 @@ from bayesmc.distributions.support import Support
 from bayesmc.errors import BayesmcError, ModelError, PlateError
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration
+from bayesmc.objects import are_objects
 from bayesmc.plates import Gathered, PlateArray
 from bayesmc.shapes import Shape, read_only
 from bayesmc.states import StateArray
@@ -178,7 +179,7 @@ def call(
         if isinstance(result, PlateArray):
             raise result.ungathered()
         array = result if isinstance(result, StateArray) else _as_array(result)
-        if array.dtype.kind not in "biuf":
+        if array.dtype.kind not in "biuf" and not are_objects(array):
             raise ModelError(
                 f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "
                 "a frozen scipy.stats one), or an array of numbers for a deterministic node"

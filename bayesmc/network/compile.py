@@ -223,6 +223,8 @@ def _deterministic(
     one, _ = bare.called(entry(bare, model.probe, model.probe_shape))
     node = replace(bare, event_shape=one.shape[len(bare.plates) :])
     value = deterministic_fit(node, result, batch)
+    if value.dtype == object:
+        return _objects(node, value)
     undefined = not possible and value.dtype.kind == "f" and np.isnan(value).any()
     if undefined and not overflows(node, model.probe):
         raise DensityError(f"node {node.name!r}: the function returns NaN on reachable values")
@@ -248,6 +250,18 @@ def _deterministic(
     if tabulated is not None:
         return tabulated, lookup(tabulated, model.probe)
     return replace(node, domain=domain), value
+
+
+def _objects(node: CompiledNode, value: np.ndarray) -> tuple[CompiledNode, np.ndarray]:
+    """A computed node whose values are frozen objects."""
+    if node.event_shape or node.declaration.states is not None:
+        what = "states=" if node.declaration.states is not None else f"axes {node.event_shape}"
+        raise ModelError(
+            f"node {node.name!r}: it returns objects, one for each element of the batch and the plates, "
+            "and these "
+            f"have no {what}"
+        )
+    return replace(node, is_object=True), value
 
 
 def _constant_of(

@@ -204,6 +204,7 @@ def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
     TraceError
         The function cannot be followed, or does not broadcast so.
     """
+    _refuse_objects(model, name)
     node = model[name]
     declaration, links = node.declaration, node.links
     if declaration.vectorize or declaration.value is not None:
@@ -249,6 +250,7 @@ def value_of(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Expr
     found = density(model, name, cut)
     if isinstance(found, Followed):
         return broadcast(found.result, node.value_shape)
+    _refuse_objects(model, name)
     parents = tuple(dict.fromkeys(node.parents))
     operands = [_stored_value(model, p, cut) for p in parents]
     stored = call(NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
@@ -330,6 +332,15 @@ def _read(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Followe
     return Opaque(reason, _leaves_above(model, name, cut))
 
 
+def _refuse_objects(model: Model, name: str) -> None:
+    """Refuse to follow what has to do with objects: expressions are of numbers."""
+    if not any(node.is_object for node in model.nodes.values()):
+        return
+    for other in (name, *model.parents(name), *deterministic_above(model, name, ())):
+        if other in model.nodes and model[other].is_object:
+            raise TraceError(f"it depends on {other!r}, whose values are objects")
+
+
 def _function(model: Model, name: str) -> Any:
     if name in model.nodes:
         return model[name].declaration.function
@@ -347,6 +358,7 @@ def _links(model: Model, name: str) -> Sequence[tuple[str, Aligner]]:
 
 def _shared(model: Model, name: str, for_all_numbers: bool, cut: frozenset[str]) -> Followed:
     """What is read of a function, which nodes that have it in the same way share."""
+    _refuse_objects(model, name)
     function, table = _function(model, name), None
     if name in model.nodes:
         node = model[name]

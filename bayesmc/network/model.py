@@ -24,6 +24,7 @@ from bayesmc.errors import (
     ModelError,
     ParameterError,
     ShapeError,
+    UnsupportedError,
 )
 from bayesmc.network.calling import Aligner, RowAligner, call
 from bayesmc.network.labels import Domain
@@ -36,7 +37,8 @@ class CompiledNode:
     """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
     ``unsampled`` says that its density has no sampler, ``noiseless`` that some element has no noise
     whatever its parents are, and so no density, ``splits`` that some components may be seen alone;
-    ``support`` is the same for all parents, ``reach`` holds those of all parents."""
+    ``support`` is the same for all parents, ``reach`` holds those of all parents; ``is_object`` says that
+    values are frozen objects."""
 
     declaration: Declaration
     links: tuple[tuple[str, Aligner], ...]
@@ -51,6 +53,7 @@ class CompiledNode:
     noiseless: bool = False
     splits: bool = False
     reach: Support | None = None
+    is_object: bool = False
 
     @property
     def name(self) -> str:
@@ -286,6 +289,22 @@ class Model:
             draws = node.domain.from_support(draws)
         draws.flags.writeable = False
         return draws
+
+
+def refuse_objects(model: Model) -> None:
+    """Refuse nodes of objects in a plain net, which no static engine takes.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    for name, node in model.nodes.items():
+        if node.is_object:
+            raise UnsupportedError(
+                f"node {name!r} holds objects ({type(model.probe[name].flat[0]).__name__}), which no "
+                "engine on a plain "
+                "net takes; declare a DynamicBayesNet and filter it with ParticleFilter(particles)"
+            )
 
 
 def deterministic_above(model: Model, name: str, known: Container[str]) -> list[str]:

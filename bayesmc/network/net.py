@@ -26,7 +26,7 @@ from bayesmc.network.evidence import read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
-from bayesmc.network.model import Model
+from bayesmc.network.model import Model, refuse_objects
 from bayesmc.network.node import Declaration, Node, Potential, decorating, without_noise
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
@@ -369,6 +369,7 @@ class BayesNet(Declared):
         """The validated snapshot that engines run on, with plate sizes settled by the data."""
         settled = settled_sizes(self._plates, self._declarations, evidence, inputs, plates)
         model = self._store.model(settled, self._inputs(settled, inputs))
+        refuse_objects(model)
         self._store.validate(model)
         return model
 

@@ -148,7 +148,8 @@ def refuse_parameters(
 
 def overflows(node: CompiledNode, probe: Mapping[str, np.ndarray]) -> bool:
     """Whether a parent is infinite already, or the function's arithmetic over- or underflows on them."""
-    if any(np.isinf(probe[name].astype(float)).any() for name in node.parents):
+    numbers = [probe[name] for name in node.parents if probe[name].dtype != object]
+    if any(np.isinf(value.astype(float)).any() for value in numbers):
         return True
     try:
         with np.errstate(over="raise", under="raise"):

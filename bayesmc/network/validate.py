@@ -177,9 +177,10 @@ def _compare_entries(
         full = (0,) * (len(shape) - len(index)) + index
         at = full[len(full) - len(batch) :]
         at = tuple(i if n > 1 else 0 for i, n in zip(at, batch, strict=True))
+        part: Any = (*at, Ellipsis)  # an array still, of objects too
         alone = _signature_at(node, entry(node, values, shape, full))
         if whole.family != alone.family or not all(
-            nearly_equal(a[at], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
+            nearly_equal(a[part], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
         ):
             raise BroadcastError(_broadcast_message(node, at, whole, alone))
 

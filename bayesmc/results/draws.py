@@ -25,15 +25,10 @@ from bayesmc.results.datatree import datatree
 from bayesmc.results.laws import DrawnLaws, Laws
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.over_time import expanded
-from bayesmc.results.posterior import (
-    Posterior,
-    circular_variance,
-    near,
-    quantile_levels,
-    whole_draws,
-)
+from bayesmc.results.posterior import Posterior, quantile_levels, whole_draws
 from bayesmc.results.query import Query
 from bayesmc.results.shares import chain_count, is_share, slowest, steps, weighted_count
+from bayesmc.results.statistics import circular_variance, near
 
 
 class DrawsPosterior(AssessedByDraws, Posterior):

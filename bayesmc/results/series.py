@@ -17,9 +17,10 @@ from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_y
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.laws import Laws, NormalLaws, TableLaws, curve_between
 from bayesmc.results.marginal_answers import MarginalAnswers
-from bayesmc.results.posterior import quantile_levels, table_variance
+from bayesmc.results.posterior import quantile_levels
 from bayesmc.results.saving import save
 from bayesmc.results.series_checks import SeriesChecks
+from bayesmc.results.statistics import table_variance
 
 #: what is asked of answers over time that has another name here, or that only some filters have
 _INSTEAD = {
@@ -167,16 +168,25 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
         """Variances, shape ``(time, *plates, *event)``; for angles ``-2 log R``."""
         node = self._node(name)
         if name in self._tables:
-            return table_variance(self._tables[name], self._numbers(node))
+            return table_variance(self._tables[name], self._numbers(node, "variance"))
         return self._variances[name].copy()
 
     def std(self, name: str) -> np.ndarray:
         """Standard deviations, shape ``(time, *plates, *event)``."""
         return np.sqrt(self.var(name))
 
-    def probabilities(self, name: str) -> np.ndarray:
-        """Probabilities of the states of a finite node, shape ``(time, *plates, states)``."""
+    def probabilities(self, name: str, *others: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(time, *plates, states)``.
+
+        Raises
+        ------
+        UnknownNodeError, UnsupportedError
+        QueryError
+            The node is not finite, or several are named: answers are kept node by node.
+        """
         self._node(name)
+        if others:
+            raise no_joint_table((name, *others), "give", "queries={'both': %s} to the call")
         if name not in self._tables:
             raise QueryError(
                 f"probabilities({name!r}): the node has no finite set of states; use mean or var, or give "
@@ -198,7 +208,7 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
         """
         node, levels = self._node(name), quantile_levels(name, q)
         if name in self._tables:
-            numbers, table = self._numbers(node), self._tables[name]
+            numbers, table = self._numbers(node, "quantile"), self._tables[name]
             below = table.cumsum(axis=-1)
             # rounding of the sum must not carry a level to the next number
             wanted = levels.reshape(1, -1, *(1,) * (table.ndim - 1)) * (1 - 1e-12)
@@ -345,10 +355,16 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
             raise UnknownNodeError(
                 f"there is no node {name!r}{did_you_mean(name, self.names)}; answered are {list(self.names)}"
             )
+        if node.is_object:
+            raise QueryError(
+                f"{name!r} holds objects, which have no mean, variance or probabilities; give "
+                "queries={name: function} that makes numbers of them, or go by start and step, where "
+                f"belief.particles({name!r}) hands them out"
+            )
         if name not in self._tables and name not in self._means:
             raise UnsupportedError(
-                f"{name!r} is not answered for by this result (answered are {list(self.names)}); ask with "
-                "queries={name: function}"
+                f"{name!r} is not answered for by this result (answered are {list(self.names)}); inputs and "
+                "static nodes are known, of other nodes of a slice ask with queries={name: function}"
             )
         return node
 
@@ -357,13 +373,45 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
             f'{what}: the particles of past slices were not held; give keep="particles" to the call'
         )
 
-    def _numbers(self, node: CompiledNode) -> np.ndarray:
-        assert node.domain is not None
-        if node.domain.labels is not None:
-            raise QueryError(
-                f"{node.name!r} has labels, which have no mean; use probabilities({node.name!r})"
-            )
-        return np.asarray(node.domain.numbers, dtype=float)
+    def _numbers(self, node: CompiledNode, what: str = "mean") -> np.ndarray:
+        return numbers_of_states(node, what)
+
+
+def numbers_of_states(node: CompiledNode, what: str = "mean") -> np.ndarray:
+    """The numbers that the states of a finite node are.
+
+    Raises
+    ------
+    QueryError
+    """
+    domain = without_labels(node, what).domain
+    assert domain is not None
+    return np.asarray(domain.numbers, dtype=float)
+
+
+def without_labels(node: CompiledNode, what: str) -> CompiledNode:
+    """The node, if its values are numbers.
+
+    Raises
+    ------
+    QueryError
+        They are labels, which do not have what is asked for.
+    """
+    if node.domain is not None and node.domain.labels is not None:
+        raise QueryError(
+            f"{node.name!r} has labels, which have no {what}; use probabilities({node.name!r})"
+        )
+    return node
+
+
+def no_joint_table(names: tuple[str, ...], verb: str, call: str) -> QueryError:
+    """The refusal of a joint table over time; ``call`` has a place for a function that stands for it."""
+    event = " & ".join(f"({name} == ...)" for name in names)
+    how = call % f"lambda {', '.join(names)}: {event}"
+    return QueryError(
+        f"probabilities({', '.join(map(repr, names))}): answers about a slice have tables of single nodes; "
+        f"of states that come together {verb} {how}, whose mean is their probability"
+    )
 
 
 def _with_own_arrays(value: Any, memo: dict[int, Any]) -> Any:

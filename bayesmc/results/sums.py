@@ -16,15 +16,10 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model, Problem
-from bayesmc.results.posterior import (
-    Posterior,
-    circular_variance,
-    quantile_levels,
-    table_quantile,
-    table_variance,
-)
+from bayesmc.results.posterior import Posterior, quantile_levels
 from bayesmc.results.running import Sums
 from bayesmc.results.shares import steps, weighted_share_count
+from bayesmc.results.statistics import circular_variance, table_quantile, table_variance
 
 #: share of a variance that is rounding
 _NONE = 1e-20

@@ -15,6 +15,8 @@ from bayesmc.robotics.calibration import FieldFit, fit_field, fit_floor, fit_odo
 from bayesmc.robotics.field import FieldScan, LikelihoodField
 from bayesmc.robotics.free_space import FreeSpace
 from bayesmc.robotics.grid import OccupancyGrid
+from bayesmc.robotics.grid_map import GridMap
+from bayesmc.robotics.grid_mapping import ScanMapper
 from bayesmc.robotics.landmarks import (
     bearing,
     bearing_to,
@@ -24,6 +26,8 @@ from bayesmc.robotics.landmarks import (
     range_to,
     sonar,
 )
+from bayesmc.robotics.laser import Laser
+from bayesmc.robotics.map_field import MapField, MapScan
 from bayesmc.robotics.mapfile import read_map, write_map
 from bayesmc.robotics.motion import OdometryMotion, VelocityMotion
 from bayesmc.robotics.placing import PlaceCheck, check_poses
@@ -40,6 +44,7 @@ from bayesmc.robotics.poses import (
     wrap,
 )
 from bayesmc.robotics.raycast import RayTable, ray_cast
+from bayesmc.robotics.scan_matching import ScanMatcher
 from bayesmc.robotics.steps import euler_step, unicycle
 
 __all__ = [
@@ -52,12 +57,18 @@ __all__ = [
     "FieldFit",
     "FieldScan",
     "FreeSpace",
+    "GridMap",
+    "Laser",
     "LikelihoodField",
+    "MapField",
+    "MapScan",
     "OccupancyGrid",
     "OdometryMotion",
     "PlaceCheck",
     "PoseNormal",
     "RayTable",
+    "ScanMapper",
+    "ScanMatcher",
     "SensorPoses",
     "VelocityMotion",
     "angle_between",

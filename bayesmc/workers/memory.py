@@ -6,12 +6,12 @@ folder) and are mapped, read-only, by whoever opens it. Handing it on is handing
 
 from __future__ import annotations
 
+import concurrent.futures
 import mmap
 import os
 import pickle
 import tempfile
 from collections.abc import Collection
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,7 +37,7 @@ class Held(NamedTuple):
 
 def shares_memory(executor: Any) -> bool:
     """Whether an executor's workers are other processes of this machine, as far as its kind tells."""
-    local = isinstance(executor, ProcessPoolExecutor)
+    local = isinstance(executor, concurrent.futures.ProcessPoolExecutor)
     return local or type(executor).__module__.startswith("loky")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import hashlib
 import os
 import sys
@@ -12,7 +13,6 @@ from concurrent.futures import (
     BrokenExecutor,
     CancelledError,
     Future,
-    ProcessPoolExecutor,
     ThreadPoolExecutor,
     wait,
 )
@@ -351,10 +351,10 @@ def _successor(executor: Any) -> tuple[Any, bool] | None:
     if type(executor).__module__.startswith("loky"):
         loky = sys.modules["loky"]
         return loky.get_reusable_executor(max_workers=executor._max_workers), False
-    if not isinstance(executor, ProcessPoolExecutor):
+    if not isinstance(executor, concurrent.futures.ProcessPoolExecutor):
         return None
     own: Any = executor
-    return ProcessPoolExecutor(
+    return concurrent.futures.ProcessPoolExecutor(
         own._max_workers, own._mp_context, own._initializer, own._initargs
     ), True
 

@@ -148,7 +148,7 @@ def test_landmarks_seen_from_a_known_pose_have_a_filter_each() -> None:
 # ---- where something is -------------------------------------------------------------------------
 
 
-def test_each_particle_is_made_linear_at_its_own_mean() -> None:
+def test_each_particle_is_linearised_at_its_own_mean() -> None:
     """A regime drives a number that is seen through its square: a loop over particles with their regimes."""
     dbn = bmc.DynamicBayesNet()
     dbn.table("s", ["s_prev"], [[0.7, 0.3], [0.4, 0.6]], initial=[0.5, 0.5])
@@ -207,7 +207,7 @@ def test_landmarks_have_a_filter_for_each_particle_and_element() -> None:
 
 
 def test_modes_drawn_given_the_row_weigh_by_each_modes_tangent() -> None:
-    """One slice: the evidence of a switching filter that is made linear, with any number of particles."""
+    """One slice: the evidence of a switching filter that is linearised, with any number of particles."""
     dbn = bmc.DynamicBayesNet()
     dbn.table("s", ["s_prev"], [[0.7, 0.3], [0.4, 0.6]], initial=[0.3, 0.7])
     dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 0.2), initial=lambda s: bmc.Normal(1.0 + s, 0.3))
@@ -280,7 +280,7 @@ def test_smoothing_draws_trajectories_of_all_nodes_and_says_so() -> None:
     rows = {"y": drawn["y"][0], "z": drawn["z"][0]}
     engine = bmc.ParticleFilter(500, marginalize=["a", "v"])
     told = bmc.explain(pendulum(), rows, engine=engine, question="smooth").effort
-    assert "nothing stays integrated out, as 'height' is made linear" in told
+    assert "nothing stays integrated out, as 'height' is linearised" in told
     found = bmc.smooth(pendulum(), rows, engine=engine, rng=0)
     right = bmc.smooth(pendulum(), rows, engine=bmc.ExtendedKalmanFilter())
     assert np.abs((found.mean("a") - right.mean("a")) / right.std("a")).max() < 0.5

@@ -409,7 +409,7 @@ FAULTS = {
         "by the last regime", Edit(SMOOTHING + "_Paths.log_after", "own + log_evidence(", "log_evidence(")
     ),
     "the noise of a slice is forgotten": (
-        "switching", Edit(MESSAGES + "_noise_of", "look @ noise[..., places, :]", "0.0")
+        "switching", Edit(MESSAGES + "_noise_of", "matrix @ noise[..., places, :]", "0.0")
     ),
 }  # fmt: skip
 

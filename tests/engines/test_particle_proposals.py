@@ -542,7 +542,7 @@ def test_vectors_that_are_affine_are_drawn_exactly() -> None:
 
 
 def test_a_bend_that_is_wide_beside_the_noise_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """30 slices: means made linear again and a guard keep the evidence, one tangent alone does not."""
+    """30 slices: means linearised again and a guard keep the evidence, one tangent alone does not."""
     rows = {"y": bent().sample(30, 1, rng=2)["y"][0]}
     grid = bmc.GridFilter(grid=X_GRID)
     exact = bmc.filter(bent(), rows, engine=grid).log_marginal_likelihood

@@ -398,7 +398,7 @@ def test_modes_without_numbers_are_exact() -> None:
     assert off(found.probabilities("s"), right.probabilities("s")) < 1e-9
 
 
-def test_functions_are_made_linear_on_the_way_forward() -> None:
+def test_functions_are_linearised_on_the_way_forward() -> None:
     dbn = jumping()
     plain = bmc.smooth(dbn, {"y": [0.1, 2.0, -1.0]}, engine=EP)
     linear = bmc.smooth(dbn, {"y": [0.1, 2.0, -1.0]}, engine=ExpectationPropagation(linearize=True))

@@ -209,16 +209,34 @@ def test_every_element_apart_has_a_last_row_of_its_own(lag: int | None) -> None:
 def test_a_gap_over_which_the_smoother_is_lost_is_warned_of() -> None:
     """Its deviations there are far above the exact ones; with data in all rows it says nothing."""
     dbn, rows = stock(), {"price": [-0.6, None, None, None, None, -3.2, -5.1, -5.2, -4.8]}
-    assert "p(x[t+1] | s[t+1], all rows)" in str(bmc.explain(dbn, rows, question="smooth"))
+    kim = SwitchingKalmanFilter()
+    assert "p(x[t+1] | s[t+1], all rows)" in str(
+        bmc.explain(dbn, rows, engine=kim, question="smooth")
+    )
     with pytest.warns(EngineWarning, match="slice 0 the standard deviation of 'level' is") as told:
-        found = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter())
+        found = bmc.smooth(dbn, rows, engine=kim)
     assert told[0].filename == __file__
+    assert "use ExpectationPropagation() or ParticleFilter(particles)" in str(told[0].message)
     right = bmc.infer(dbn, rows, engine=bmc.Exact())
     assert np.sqrt(found.var("level")[0] / right.var("level[0]")) > 1.5
     for seen in (PRICES, [0.1, 0.0, 0.3, 0.2, 2.6, 1.1, 1.4], [None, None, 0.3, 0.6]):
         with warnings.catch_warnings():
             warnings.simplefilter("error", EngineWarning)
             bmc.smooth(dbn, {"price": seen}, engine=SwitchingKalmanFilter())
+
+
+def test_what_has_just_failed_is_not_advised(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*args: Any) -> Any:
+        raise UnsupportedError("messages are lost")
+
+    monkeypatch.setattr(bmc.ExpectationPropagation, "smoothed", fails)
+    rows = {"price": [-0.6, None, None, None, None, -3.2, -5.1, -5.2, -4.8]}
+    with pytest.warns(EngineWarning) as told:
+        bmc.smooth(stock(), rows)
+    why, gap = (str(w.message) for w in told)
+    assert "messages are lost" in why
+    assert gap.endswith("too wide: use ParticleFilter(particles)")
+    assert told[1].filename == __file__
 
 
 def test_random_templates_raise_no_false_alarm_of_gaps() -> None:
@@ -306,7 +324,7 @@ def test_what_is_bad_where_a_mode_can_be_is_told_with_one_slice_and_the_mode() -
 
 @pytest.mark.parametrize("has_modes", [False, True])
 def test_remedies_that_are_named_can_answer(has_modes: bool) -> None:
-    """A hidden count is for none of them; what counts by a hidden number is for those made linear."""
+    """A hidden count is for none of them; what counts by a hidden number is for those linearised."""
     hidden, seen = bmc.DynamicBayesNet(), bmc.DynamicBayesNet()
     for dbn in (hidden, seen):
         if has_modes:

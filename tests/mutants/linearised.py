@@ -1,4 +1,4 @@
-"""Faults of nodes that are made linear, where nothing is sampled and they are extended Kalman filters."""
+"""Faults of nodes that are linearised, where nothing is sampled and they are extended Kalman filters."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def extended(seed: int) -> Verdict:
 
 
 BY = "repeated_test against ExtendedKalmanFilter"
-WHERE = "bayesmc.engines.marginal.linearised:LinearisedReader._made_linear"
+WHERE = "bayesmc.engines.marginal.linearised:LinearisedReader._linearised"
 MUTANTS = [
     Mutant(
         "derivatives are taken where the slice before was, not where this one is expected",
@@ -50,7 +50,7 @@ MUTANTS = [
         extended, BY,
     ),
     Mutant(
-        "a slice is made linear beside the mean of the one before",
+        "a slice is linearised beside the mean of the one before",
         (Edit(WHERE, "centre[..., :n] = mean", "centre[..., :n] = mean + 0.1"),),
         extended, BY,
     ),

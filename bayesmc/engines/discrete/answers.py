@@ -20,7 +20,7 @@ from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, Unsupporte
 from bayesmc.factors.named import choices_of
 from bayesmc.network import CompiledNode
 from bayesmc.network.node import nodes_read
-from bayesmc.results.posterior import circular_variance
+from bayesmc.results.statistics import circular_variance
 from bayesmc.shapes import padded, unravelled
 
 

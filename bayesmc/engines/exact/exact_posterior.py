@@ -22,14 +22,9 @@ from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.laws import Laws, point_laws
 from bayesmc.results.marginal import Marginal, gaussian_marginal
 from bayesmc.results.over_time import expanded
-from bayesmc.results.posterior import (
-    Posterior,
-    quantile_levels,
-    table_quantile,
-    table_variance,
-    whole_draws,
-)
+from bayesmc.results.posterior import Posterior, quantile_levels, whole_draws
 from bayesmc.results.query import Query
+from bayesmc.results.statistics import table_quantile, table_variance
 from bayesmc.structure import known_values
 
 

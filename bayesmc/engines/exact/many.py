@@ -15,7 +15,8 @@ from bayesmc.factors import BoundTree
 from bayesmc.factors.many import OneOfMany, block_size, calibrate_many, is_worth_it
 from bayesmc.network import Observed, Problem
 from bayesmc.results.many import Posteriors
-from bayesmc.results.posterior import Posterior, table_variance
+from bayesmc.results.posterior import Posterior
+from bayesmc.results.statistics import table_variance
 
 #: blocks in a unit of work
 _BLOCKS = 8

@@ -20,7 +20,7 @@ from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.factors.named import Named, aligned, contract
 from bayesmc.network import CompiledNode
 from bayesmc.network.node import nodes_read
-from bayesmc.results.posterior import circular_variance
+from bayesmc.results.statistics import circular_variance
 from bayesmc.shapes import padded
 
 Moments = tuple[np.ndarray, np.ndarray]

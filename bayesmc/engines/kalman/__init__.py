@@ -1,1 +1,1 @@
-"""Kalman filters: linear-Gaussian templates exactly, others made linear or through sigma points."""
+"""Kalman filters: linear-Gaussian templates exactly, others linearised or through sigma points."""

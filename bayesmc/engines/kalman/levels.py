@@ -139,7 +139,7 @@ class Followed:
 
 
 class Made(NamedTuple):
-    """A level made linear.
+    """A level linearised.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""``ExtendedKalmanFilter`` and ``UnscentedKalmanFilter``: every slice made linear where the belief is.
+"""``ExtendedKalmanFilter`` and ``UnscentedKalmanFilter``: every slice linearised where the belief is.
 
 They differ in the rule alone: derivatives at the mean, or sigma points around it.
 """

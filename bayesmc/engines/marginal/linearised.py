@@ -1,6 +1,6 @@
-"""Named nodes whose means are not affine: made linear at each particle's own mean.
+"""Named nodes whose means are not affine: linearised at each particle's own mean.
 
-As the extended Kalman filter does, level by level of the slice: what reads the slice before is made linear at
+As the extended Kalman filter does, level by level of the slice: what reads the slice before is linearised at
 what is believed of that, what reads this slice at what is expected of it. Derivatives are those of the
 declared functions' expressions, of all particles in one call. What comes of it is an approximation, the
 evidence included. Scales that depend on what is integrated out have no place in it, nor have other families.
@@ -46,7 +46,7 @@ _NOT_NORMAL = "depends on what is integrated out and is not Normal or MvNormal"
 
 
 def why_not_bent(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> str | None:
-    """Why a node cannot be made linear in what is unknown, to follow its name; or None.
+    """Why a node cannot be linearised in what is unknown, to follow its name; or None.
 
     Parameters
     ----------
@@ -117,16 +117,16 @@ class LinearisedReader(SliceReader):
         return None
 
     def read(self, values: Values) -> Coefficients:
-        made = self._made_linear(values.at(None), self.before.mean)
+        made = self._linearised(values.at(None), self.before.mean)
         return Coefficients(made.offset[:, None], made.moves[:, None], made.noise[:, None], None)
 
     def read_choices(self, values: Mapping[str, np.ndarray], kinds: int, choices: int) -> Linear:
-        made = self._made_linear(dict(values), self.before.mean.repeat(choices, axis=0))
+        made = self._linearised(dict(values), self.before.mean.repeat(choices, axis=0))
         return Linear(*(a.reshape(kinds, choices, *a.shape[1:]) for a in made))
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _made_linear(self, values: dict[str, np.ndarray], mean: np.ndarray) -> Linear:
+    def _linearised(self, values: dict[str, np.ndarray], mean: np.ndarray) -> Linear:
         """Tangents at means, shape ``(batch, *lead, n_prev)``."""
         layout = self.layout
         for name in layout.computed:

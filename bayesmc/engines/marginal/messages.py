@@ -3,11 +3,12 @@
 Given all that is sampled from a slice on, the density of the rows after it is, as a function of the numbers m
 that the next slice reads,
 
-    exp(-|look @ m - target|^2 / 2)
+    exp(-|matrix @ m - vector|^2 / 2)
 
-up to a constant. ``look`` has no more rows than m has numbers, fewer where rows do not tell all of them. No
-density of a transition is asked for, so numbers without noise of their own are nothing special: what is told
-without noise is told with 10^-9 of its own size, which is far below what rounding leaves of a likelihood.
+up to a constant: a root of the information matrix, and the vector that goes with it. ``matrix`` has no more
+rows than m has numbers, fewer where rows do not tell all of them. No density of a transition is asked for,
+so numbers without noise of their own are nothing special: what is told without noise is told with 10^-9 of
+its own size, which is far below what rounding leaves of a likelihood.
 
 References
 ----------
@@ -34,28 +35,28 @@ _ENTRIES = 1 << 20
 
 
 class Message(NamedTuple):
-    """Of some draws, which share ``look`` where they sampled what it depends on alike.
+    """Of some draws, which share ``matrix`` where they sampled what it depends on alike.
 
     Attributes
     ----------
-    look : ndarray, shape (kinds, *lead, r, c)
-    target : ndarray, shape (draws, *lead, r)
+    matrix : ndarray, shape (kinds, *lead, r, c)
+    vector : ndarray, shape (draws, *lead, r)
     kind : ndarray of int, shape (draws,)
     """
 
-    look: np.ndarray
-    target: np.ndarray
+    matrix: np.ndarray
+    vector: np.ndarray
     kind: np.ndarray
 
     def taken(self, at: np.ndarray) -> Message:
         """Of some of the draws."""
-        return Message(self.look, self.target.take(at, axis=0), self.kind.take(at))
+        return Message(self.matrix, self.vector.take(at, axis=0), self.kind.take(at))
 
 
-def silence(draws: int, lead: tuple[int, ...], numbers: int) -> Message:
+def uninformative(draws: int, lead: tuple[int, ...], numbers: int) -> Message:
     """After the last row."""
-    look, target = np.zeros((1, *lead, 0, numbers)), np.zeros((draws, *lead, 0))
-    return Message(look, target, np.zeros(draws, dtype=np.intp))
+    matrix, vector = np.zeros((1, *lead, 0, numbers)), np.zeros((draws, *lead, 0))
+    return Message(matrix, vector, np.zeros(draws, dtype=np.intp))
 
 
 def sizes_of(before: Gaussians) -> np.ndarray:
@@ -94,16 +95,16 @@ def pulled(
     Message
     ndarray, shape (draws, *lead)
     """
-    draws, places = len(after.target), np.arange(layout.p, layout.p + layout.carried)
+    draws, places = len(after.vector), np.arange(layout.p, layout.p + layout.carried)
     theirs = np.arange(draws) if found.kind is None else found.kind
     pairs, kind = np.unique(after.kind * len(found.moves) + theirs, return_inverse=True)
-    of_look, of_slice = pairs // len(found.moves), pairs % len(found.moves)
-    look = after.look.take(of_look, axis=0)
+    of_matrix, of_slice = pairs // len(found.moves), pairs % len(found.moves)
+    matrix = after.matrix.take(of_matrix, axis=0)
     moves, noise = found.moves[of_slice, 0], found.noise[of_slice, 0]
     told = moves[..., pattern.observed, :]
     terms = np.abs(told) @ sizes[..., None] + np.abs(row)[..., None]
-    own = _noise_of(pattern, look, noise, places, terms)
-    whole = np.concatenate([told, look @ moves[..., places, :]], axis=-2)
+    own = _noise_of(pattern, matrix, noise, places, terms)
+    whole = np.concatenate([told, matrix @ moves[..., places, :]], axis=-2)
     if pattern.absent is not None:
         whole[..., : len(pattern.observed), :][..., pattern.absent, :] = 0.0
     root = np.matrix_transpose(np.linalg.qr(np.matrix_transpose(own), mode="r"))
@@ -114,7 +115,7 @@ def pulled(
     offset = found.offset[:, 0]
     off = np.concatenate(
         [row - offset[..., pattern.observed],
-         after.target - np.matvec(after.look[after.kind], offset[..., places])],
+         after.vector - np.matvec(after.matrix[after.kind], offset[..., places])],
         axis=-1,
     )  # fmt: skip
     if pattern.absent is not None:
@@ -122,16 +123,16 @@ def pulled(
             pattern.absent, 0.0, off[..., : len(pattern.observed)]
         )
     eta = _times(inverse, kind, off)
-    target = _times(np.matrix_transpose(basis), kind, eta)
-    left = eta - _times(basis, kind, target)
+    vector = _times(np.matrix_transpose(basis), kind, eta)
+    left = eta - _times(basis, kind, vector)
     log = -0.5 * np.vecdot(left, left) - np.log(np.abs(diagonal)).sum(axis=-1)[kind]
-    return Message(short, target, kind), log
+    return Message(short, vector, kind), log
 
 
 def log_evidence(
     message: Message, of: np.ndarray, beliefs: Gaussians, about: np.ndarray
 ) -> np.ndarray:
-    """Log of the mean of ``exp(-|look @ m - target|^2 / 2)``, by the beliefs about m.
+    """Log of the mean of ``exp(-|matrix @ m - vector|^2 / 2)``, by the beliefs about m.
 
     Parameters
     ----------
@@ -146,24 +147,24 @@ def log_evidence(
     -------
     ndarray, shape (pairs, *lead)
     """
-    lead, (r, c) = beliefs.layout.lead, message.look.shape[-2:]
+    lead, (r, c) = beliefs.layout.lead, message.matrix.shape[-2:]
     found = np.zeros((len(of), *lead))
     if not r:
         return found
     pools = len(beliefs.factors)
     theirs = about if beliefs.which is None else beliefs.which[about]
-    kinds = len(message.look) * pools
+    kinds = len(message.matrix) * pools
     shared = kinds <= max(len(of) // 4, 1)
-    made = _joined(message.look[:, None], beliefs.factors[None, ..., :c, :]) if shared else None
+    made = _joined(message.matrix[:, None], beliefs.factors[None, ..., :c, :]) if shared else None
     step = max(1, _ENTRIES // (r * beliefs.factors.shape[-1] * max(int(np.prod(lead)), 1)))
     for low in range(0, len(of), step):
         at = slice(low, low + step)
-        look = message.look[message.kind[of[at]]]
+        matrix = message.matrix[message.kind[of[at]]]
         if made is not None:
             root = made[message.kind[of[at]], theirs[at]]
         else:
-            root = _joined(look, beliefs.factors[theirs[at]][..., :c, :])
-        off = message.target[of[at]] - np.matvec(look, beliefs.mean[about[at]][..., :c])
+            root = _joined(matrix, beliefs.factors[theirs[at]][..., :c, :])
+        off = message.vector[of[at]] - np.matvec(matrix, beliefs.mean[about[at]][..., :c])
         eta = solve_lower(root, off)
         log_det = np.log(root.diagonal(0, -2, -1)).sum(axis=-1)
         found[at] = -0.5 * np.vecdot(eta, eta) - log_det
@@ -172,20 +173,20 @@ def log_evidence(
 
 def combined(message: Message, beliefs: Gaussians) -> Gaussians:
     """Each draw's belief with what later rows say."""
-    r, c = message.look.shape[-2:]
+    r, c = message.matrix.shape[-2:]
     if not r:
         return beliefs._replace(over=None)
     draws = len(beliefs.mean)
     theirs = np.arange(draws) if beliefs.which is None else beliefs.which
     pools = len(beliefs.factors)
     pairs, which = np.unique(message.kind * pools + theirs, return_inverse=True)
-    look, factors = message.look[pairs // pools], beliefs.factors[pairs % pools]
-    seen = look @ factors[..., :c, :]
+    matrix, factors = message.matrix[pairs // pools], beliefs.factors[pairs % pools]
+    seen = matrix @ factors[..., :c, :]
     unit = np.broadcast_to(np.eye(seen.shape[-1]), (*seen.shape[:-2], *[seen.shape[-1]] * 2))
     basis, upper = np.linalg.qr(np.concatenate([seen, unit], axis=-2))
     after = solve_lower(np.matrix_transpose(upper)[..., None, :, :], factors)
     gain = after, np.matrix_transpose(basis[..., :r, :])  # one after the other: rows may be huge
-    off = message.target - np.matvec(message.look[message.kind], beliefs.mean[..., :c])
+    off = message.vector - np.matvec(message.matrix[message.kind], beliefs.mean[..., :c])
     mean = beliefs.mean + _times(gain[0], which, _times(gain[1], which, off))
     return beliefs._replace(mean=mean, factors=after, which=which, over=None)
 
@@ -194,14 +195,14 @@ def combined(message: Message, beliefs: Gaussians) -> Gaussians:
 
 
 def _noise_of(
-    pattern: Pattern, look: np.ndarray, noise: np.ndarray, places: np.ndarray, terms: np.ndarray
+    pattern: Pattern, matrix: np.ndarray, noise: np.ndarray, places: np.ndarray, terms: np.ndarray
 ) -> np.ndarray:
     """Rows of the noise of what is observed, and of what is told of the slice after, by its own."""
-    seen, (r, q) = len(pattern.observed), (look.shape[-2], noise.shape[-1])
-    lead = np.broadcast_shapes(look.shape[:-2], noise.shape[:-2])
+    seen, (r, q) = len(pattern.observed), (matrix.shape[-2], noise.shape[-1])
+    lead = np.broadcast_shapes(matrix.shape[:-2], noise.shape[:-2])
     found = np.zeros((*lead, seen + r, q + seen + r))
     found[..., :seen, :q] = noise[..., pattern.observed, :]
-    found[..., seen:, :q] = look @ noise[..., places, :]
+    found[..., seen:, :q] = matrix @ noise[..., places, :]
     own = _EXACT * terms[..., 0] + 1e-300
     if pattern.absent is not None:
         found[..., :seen, :q][..., pattern.absent, :] = 0.0
@@ -213,9 +214,9 @@ def _noise_of(
     return found
 
 
-def _joined(look: np.ndarray, factors: np.ndarray) -> np.ndarray:
+def _joined(matrix: np.ndarray, factors: np.ndarray) -> np.ndarray:
     """Roots of the covariances of what is looked at, with noise of its own."""
-    seen = look @ factors
+    seen = matrix @ factors
     return np.linalg.cholesky(seen @ np.matrix_transpose(seen) + np.eye(seen.shape[-2]))
 
 

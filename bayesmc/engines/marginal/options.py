@@ -167,6 +167,13 @@ def asking(engine: Any, what: str) -> Any:
     return found
 
 
+def sampling(engine: Any) -> Any:
+    """The same engine, which integrates nothing out."""
+    found = object.__new__(type(engine))
+    found.__dict__.update(engine.__dict__, marginalize=None)
+    return found
+
+
 def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | None:
     """Why a question about the past has no answer, or None."""
     if what not in PAST:

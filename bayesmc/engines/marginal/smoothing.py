@@ -39,8 +39,8 @@ from bayesmc.engines.marginal.messages import (
     combined,
     log_evidence,
     pulled,
-    silence,
     sizes_of,
+    uninformative,
 )
 from bayesmc.engines.marginal.reading import Values
 from bayesmc.engines.marginal.split import Split, layouts_of
@@ -97,7 +97,7 @@ class MarginalBackward:
         index = rng.permuted(systematic(filtered[-1].weights, count, rng))
         positions = [index]
         here = filtered[-1]
-        values, message = paths.taken(paths.sampled(here), index), paths.silence(count)
+        values, message = paths.taken(paths.sampled(here), index), paths.uninformative(count)
         drawn, messages = [values], [message]
         for k in range(len(filtered) - 2, -1, -1):
             index = self._drawn(paths, k, values, message, _parents(filtered[k + 1], index), rng)
@@ -152,7 +152,7 @@ def why_not_backwards(slices: Slices, split: Split) -> str | None:
     if apart:
         return f"elements of plate {apart[0]!r} are filtered separately"
     if split.linearised:
-        return f"{min(split.linearised)!r} is made linear at each particle's own mean, which paths change"
+        return f"{min(split.linearised)!r} is linearised at each particle's own mean, which paths change"
     carried = carried_on(slices, split.seen) - layouts_of(slices, split.inner, ())[1].unknown
     if carried:
         return f"{min(carried)!r} is computed from sampled nodes of the slice before, and read by the next"
@@ -188,11 +188,11 @@ class _Paths:
         self.step, self.filtered, self.series = step, filtered, series
         self._crossing: dict[Any, tuple[list[Step], bool]] = {}
 
-    def silence(self, count: int) -> _Later:
+    def uninformative(self, count: int) -> _Later:
         """What is said to the last slice."""
         layout, tables = self.filtered[-1].inner.layout, self.step.tables
         own = () if tables is None else nothing_after(tables, count)
-        return _Later(silence(count, layout.lead, layout.carried), own)
+        return _Later(uninformative(count, layout.lead, layout.carried), own)
 
     def sampled(self, here: Particles) -> dict[str, np.ndarray]:
         """Values that particles of a slice have, but for those that are integrated out."""
@@ -264,7 +264,7 @@ class _Paths:
     ) -> tuple[_Later, np.ndarray]:
         """What is said to the k-th slice, given what is said to the next and values of both."""
         place, row = self._place(k + 1), self.series.row(k + 1)
-        count = len(message.numbers.target)
+        count = len(message.numbers.vector)
         known = self._values(place, row, before, values, count)
         pattern, target, _ = seen_of(place.layout, row)
         found = place.reader.read(known)
@@ -283,7 +283,7 @@ class _Paths:
         rng: np.random.Generator,
     ) -> list[Particles]:
         """Smoothed beliefs given each path, and one draw of them for all slices."""
-        count, found = len(messages[0].numbers.target), []
+        count, found = len(messages[0].numbers.vector), []
         layout = Layout(count, (), ())
         filtered: Gaussians | None = None
         joint: Gaussians | None = None

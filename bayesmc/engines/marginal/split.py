@@ -19,7 +19,7 @@ from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.kalman.reading import why_not_placed
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.marginal.linearised import why_not_bent
-from bayesmc.engines.marginal.tables.plan import MET, TablePlan, nodes_read
+from bayesmc.engines.marginal.tables.plan import TablePlan, nodes_read
 from bayesmc.engines.marginal.tables.search import found_plan, is_finite, named_plan
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError, did_you_mean
@@ -45,7 +45,7 @@ class Split:
     why : dict
         Hidden node that is sampled -> why it is not integrated out.
     linearised : dict
-        Node whose mean is made linear at each particle's own mean -> why it must be.
+        Node whose mean is linearised at each particle's own mean -> why it must be.
     tables : TablePlan or None
         Finite nodes that are integrated out.
     """
@@ -155,7 +155,6 @@ def _found(
         tables, why = found_plan(slices, search.hidden, seen, apart_from, static)
         waits = frozenset() if tables is None else loose & tables.below
         inner = tuple(n for n in numbers.inner if n not in waits)
-        why = {n: w for n, w in why.items() if not w.endswith(MET)}
         return replace(numbers, inner=inner, why={**numbers.why, **why}, tables=tables)
     finite = [n for n in asked if n in search.hidden and is_finite(slices, n)]
     others = tuple(n for n in asked if n not in finite)
@@ -188,7 +187,7 @@ class _Search:
             for n, v in model.probe.items()
         } | dict(static)
         self.why: dict[str, str] = {}
-        #: nodes that are made linear, once it is asked for by name
+        #: nodes that are linearised, once it is asked for by name
         self.bent: dict[str, str] | None = None
 
     def found(self) -> Split:
@@ -360,4 +359,4 @@ class _Search:
         if why is None:
             self.bent[name] = reason
             return None
-        return f"{reason}; it cannot be made linear, either: it {why}"
+        return f"{reason}; it cannot be linearised, either: it {why}"

@@ -54,6 +54,10 @@ class MarginalPlan(SlicePlan):
         return self._build(row)
 
 
+class UnseenError(UnsupportedError):
+    """A node is missing that everything rests on being seen; nothing was drawn yet."""
+
+
 class Place(NamedTuple):
     """What rows in which the same nodes are seen have in common.
 
@@ -297,8 +301,7 @@ class MarginalStep(FilterStep):
 
         Raises
         ------
-        UnsupportedError
-            A node is missing that everything rests on being seen.
+        UnseenError
         """
         carried = () if inner is None else inner.layout.after
         partly = any(seen.mask is not None for seen in row.seen.values())
@@ -313,12 +316,14 @@ class MarginalStep(FilterStep):
             if self.tables is not None:
                 layout = self.tables.without(layout)
             guarded = [n for n in layout.seen if n not in full]
-            pair = (sorted(late)[0], guarded[0]) if guarded else None
+            missed = sorted(late) or [n for n in layout.before if n in self.split.below]
+            pair = (missed[0], guarded[0]) if guarded else None
             if self.tables is not None and pair is None:
                 pair = self.tables.unexplained(full, self.split.seen)
             if pair is not None:
-                raise UnsupportedError(
-                    f"ParticleFilter(marginalize=...): {pair[0]!r} is missing in slice {row.t}, and "
+                when = "in the slice before" if not late and guarded else f"in slice {row.t}"
+                raise UnseenError(
+                    f"ParticleFilter(marginalize=...): {pair[0]!r} is missing {when}, and "
                     f"{pair[1]!r}, which is sampled, depends on it; start with a row that lacks it, or "
                     "give marginalize=None"
                 )

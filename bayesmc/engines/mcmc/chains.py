@@ -233,8 +233,6 @@ class ChainEngine(Engine):
             checkpoint.finish(posterior, lazily)
         if not self.silent:
             self._warn(posterior, sampler, finished, lengths)
-        if not finished:
-            posterior.checkpoint = None
         return posterior
 
     def _in_groups(
@@ -423,15 +421,10 @@ class ChainEngine(Engine):
         point = {} if posterior.checkpoint is None else posterior.checkpoint.state
         if not finished:
             chains, draws = posterior._chains_and_draws
-            message = (
-                f"{name}: interrupted; the posterior has the {draws} draws of each of {chains} chains "
-                "made so far, and "
-                + (
-                    "groups that were stopped cannot be continued"
-                    if GROUPS in point
-                    else "infer(..., resume=posterior) continues them"
-                )
-            )
+            more = "infer(..., resume=posterior) continues them"
+            more = "groups that were stopped cannot be continued" if GROUPS in point else more
+            made = f"the {draws} draws of each of {chains} chains made so far"
+            message = f"{name}: interrupted; the posterior has {made}, and {more}"
             warnings.warn(message, InterruptWarning, stacklevel=5)
         forward = self._forward(sampler)
         found = poor_mixing(posterior, forward, lengths.ess)

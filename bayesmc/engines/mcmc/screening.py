@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.network import CompiledNode, Model
-from bayesmc.results.posterior import near
+from bayesmc.results.statistics import near
 
 #: scalars looked at
 _SCALARS = 200

@@ -19,6 +19,7 @@ from bayesmc.network import CompiledNode, Model
 from bayesmc.network.node import nodes_read
 from bayesmc.results.laws import DrawnLaws, Laws, SliceLaws, curve_between
 from bayesmc.results.posterior import quantile_levels
+from bayesmc.results.series import numbers_of_states
 
 
 class Answers(NamedTuple):
@@ -113,16 +114,16 @@ class Answers(NamedTuple):
         weights = particles.weights.reshape(particles.weights.shape + more)
         return (weights * values).sum(axis=0) / total.reshape(total.shape + more)
 
-    def _numbers(self, particles: Particles, node: CompiledNode) -> np.ndarray:
+    def _numbers(self, particles: Particles, node: CompiledNode, what: str = "mean") -> np.ndarray:
         """A node's values, of labels none, with an axis of particles."""
         value = particles.values[node.name]
-        value = value if node.domain is None else numbers_of(node)[value]
+        value = value if node.domain is None else numbers_of_states(node, what)[value]
         return np.broadcast_to(value, (len(particles.weights), *node.value_shape))
 
     def _means(self, particles: Particles, node: CompiledNode) -> np.ndarray:
         """The same; of what is integrated out each particle's own mean."""
         if has_table(particles, node):
-            return np.asarray(particles.tables.probabilities(node.name) @ numbers_of(node))
+            return np.asarray(particles.tables.probabilities(node.name) @ numbers_of_states(node))
         inner = particles.inner
         if inner is not None and inner.has(node.name):
             return np.asarray(inner.mean_of(node))
@@ -148,14 +149,14 @@ class Answers(NamedTuple):
     def _quantiles(self, now: Particles, node: CompiledNode, levels: Any) -> np.ndarray:
         numbers, weights = self._placed(now, node)
         if has_table(now, node):
-            return table_quantiles(now.tables, node.name, numbers_of(node), weights, levels)
+            return table_quantiles(now.tables, node.name, numbers_of_states(node), weights, levels)
         if now.inner is not None and now.inner.has(node.name):
             return mixture_quantiles(now.inner, node, weights, levels)
         return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
 
     def _placed(self, now: Particles, node: CompiledNode) -> tuple[np.ndarray, np.ndarray]:
         """A node's numbers in one slice, angles near their mean, and a weight for each."""
-        layout, numbers = self.layout, self._numbers(now, node)
+        layout, numbers = self.layout, self._numbers(now, node, "quantile")
         if node.angles is not None:  # an order needs a cut: opposite the mean
             mean = Block(layout, [now]).mean_and_variance(node)[0][0]
             near = mean + np.remainder(numbers - mean + np.pi, 2 * np.pi) - np.pi
@@ -177,7 +178,7 @@ class Answers(NamedTuple):
         if now.inner is not None and any(now.inner.has(name) for name in names):
             matrix += covariance_within(now.inner, nodes, shares)
         if now.tables is not None:
-            numbers = {n.name: numbers_of(n) for n in nodes if has_table(now, n)}
+            numbers = {n.name: numbers_of_states(n) for n in nodes if has_table(now, n)}
             matrix += table_covariance(now.tables, nodes, numbers, shares)
         return matrix[0, 0] if matrix.size == 1 else matrix
 
@@ -227,16 +228,3 @@ def at_scouts(
     count = len(next(iter(values.values())))
     few = particles._replace(values=values, weights=np.ones(count))
     return evaluated(layout, few, model, function)
-
-
-def numbers_of(node: CompiledNode) -> np.ndarray:
-    """The numbers that a finite node's states stand for.
-
-    Raises
-    ------
-    QueryError
-    """
-    assert node.domain is not None
-    if node.domain.labels is not None:
-        raise QueryError(f"{node.name!r} has labels, which have no mean; use probabilities")
-    return np.asarray(node.domain.numbers, dtype=float)

@@ -12,7 +12,9 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, Slices, read_static
 from bayesmc.engines.beliefs import OnlineBelief
-from bayesmc.engines.particles.answers import Answers, numbers_of
+from bayesmc.engines.marginal.options import AUTO, sampling
+from bayesmc.engines.marginal.step import UnseenError
+from bayesmc.engines.particles.answers import Answers
 from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.enough import COLLAPSED
 from bayesmc.engines.particles.errors import ByFamily, node_errors
@@ -22,12 +24,13 @@ from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.lags import looked_back
 from bayesmc.engines.particles.smc import Bare, Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
-from bayesmc.errors import LowEssWarning, QueryError, UnknownNodeError
+from bayesmc.errors import LowEssWarning, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.randomness import Purpose, resumed, stream
 from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal_answers import MarginalAnswers
-from bayesmc.results.posterior import table_variance
+from bayesmc.results.series import no_joint_table, numbers_of_states
+from bayesmc.results.statistics import table_variance
 
 
 class ParticleBelief(OnlineBelief):
@@ -187,7 +190,7 @@ class ParticleBelief(OnlineBelief):
         """
         if callable(what):
             return self._answers.mcse(what)[0]
-        node, block = self._node(what), self._block
+        node, block = self._numbers(what), self._block
         assert self.families is not None
         return node_errors(ByFamily(block, [self.families]), block, node)[0]
 
@@ -199,25 +202,27 @@ class ParticleBelief(OnlineBelief):
 
     def mean(self, name: str) -> np.ndarray:
         """Mean, shape ``(*plates, *event)``; circular for angles."""
-        node = self._node(name)
+        node = self._numbers(name)
         if node.domain is None:
             return self._block.mean(node)[0]
-        return self._block.table(node)[0] @ numbers_of(node)
+        return self._block.table(node)[0] @ numbers_of_states(node)
 
     def var(self, name: str) -> np.ndarray:
         """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
-        node = self._node(name)
+        node = self._numbers(name)
         if node.domain is None:
             return self._block.mean_and_variance(node)[1][0]
-        return table_variance(self._block.table(node)[0], numbers_of(node))
+        return table_variance(self._block.table(node)[0], numbers_of_states(node, "variance"))
 
     def std(self, name: str) -> np.ndarray:
         """Standard deviation, shape ``(*plates, *event)``."""
         return np.sqrt(self.var(name))
 
-    def probabilities(self, name: str) -> np.ndarray:
-        """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
-        node = self._node(name)
+    def probabilities(self, name: str, *others: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(*plates, states)``; of one at a time."""
+        if others:
+            raise no_joint_table((name, *others), "ask", "expectation(%s)")
+        node = self._numbers(name)
         if node.domain is None:
             raise QueryError(
                 f"probabilities({name!r}): the node has no finite set of states; use mean, var or expectation"
@@ -234,11 +239,11 @@ class ParticleBelief(OnlineBelief):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(*q.shape, *plates, *event)``; those of angles are cut opposite the mean."""
-        return self._answers.quantile(self._node(name).name, q)[0]
+        return self._answers.quantile(self._numbers(name).name, q)[0]
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrix of all numbers of the named nodes, in order; of one number, its variance."""
-        return self._answers.cov(*(self._node(name).name for name in names))[0]
+        return self._answers.cov(*(self._numbers(name).name for name in names))[0]
 
     def __repr__(self) -> str:
         if self.now is None:
@@ -281,9 +286,22 @@ class ParticleBelief(OnlineBelief):
         assert self.made_by is not None
         return self.made_by
 
+    def _numbers(self, name: str) -> CompiledNode:
+        """A node that has numbers, or states."""
+        node = self._node(name)
+        if node.is_object:
+            raise QueryError(
+                f"{name!r} holds objects, which have no mean, variance, quantiles or probabilities; see "
+                f"particles({name!r}), or ask for the expectation of a function that makes numbers of them"
+            )
+        return node
+
     def _node(self, name: str) -> CompiledNode:
         now = self._particles
         if name not in now.values:
+            slices = self._step.slices
+            if name in slices.template.static or name in slices.template.inputs:
+                raise QueryError(f"{name!r} is an input or static: its value is what was given")
             raise UnknownNodeError(
                 f"particles of {name!r} are not kept; there are those of {list(now.values)}"
             )
@@ -305,7 +323,7 @@ class _Cloud(MarginalAnswers):
             return self.belief._answers.laws(name)
         labels = node.domain.labels is not None
         return TableLaws(
-            self.belief.probabilities(name)[None], None if labels else numbers_of(node), name
+            self.belief.probabilities(name)[None], None if labels else numbers_of_states(node), name
         )
 
     def _lead(self) -> int:
@@ -327,6 +345,8 @@ def bound(
         )
     inner = None if belief.now is None else belief.now.inner
     seen = () if inner is None else inner.seen
+    if belief.now is not None and inner is None:
+        engine = sampling(engine)
     step = engine.step_of(slices, read_static(slices, belief.static), seen=seen)
     step.lag = engine.delay or 0
     return ParticleBelief(
@@ -346,13 +366,23 @@ def absorbed(engine: Any, belief: ParticleBelief, slices: Slices, row: Row) -> P
     tracker = Tracker(step) if tracker is None else tracker
     chance = belief.chance
     rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
+    before = belief.now
     with quiet():
-        now = step(belief.now, row, rng)
-        families = tracker.after_one(belief.families, belief.now, now, row)
+        try:
+            now = step(before, row, rng)
+        except UnseenError as error:
+            if before is None or step.lag or engine.marginalize != AUTO:
+                way = ", or leave delay= out" if step.lag else ""
+                raise UnsupportedError(f"{error}{way}") from None
+            # a weighted draw of all nodes is one of the belief: go on with that
+            step = sampling(engine).step_of(slices, read_static(slices, belief.static))
+            tracker, before = Tracker(step), before._replace(inner=None, tables=None)
+            now = step(before, row, rng)
+        families = tracker.after_one(belief.families, before, now, row)
     total = belief.log_marginal_likelihood + now.increment
     known = step.lag if now.inner is None else min(step.lag, len(now.inner.past) - 1)
-    before = belief.window[-known:] if known > 0 else ()
-    bare = tuple(p._replace(inner=None) for p in before)  # the newest knows of all before
+    window = belief.window[-known:] if known > 0 else ()
+    bare = tuple(p._replace(inner=None) for p in window)  # the newest knows of all before
     return ParticleBelief(
         belief.dbn, belief.seed, belief.static, step, now,
         total if np.ndim(total) else float(total), rng.bit_generator.state,

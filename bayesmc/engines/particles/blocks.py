@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.network import CompiledNode
-from bayesmc.results.posterior import circular_variance
+from bayesmc.results.statistics import circular_variance
 
 #: numbers of all particles of slices that are looked at side by side: what costs is calling NumPy
 NUMBERS = 1 << 17

@@ -28,6 +28,7 @@ from bayesmc.engines.particles.options import (
     check_count,
     check_kind,
     check_numbers,
+    check_parts,
     check_together,
     described,
     looks_told,
@@ -44,6 +45,7 @@ from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
 from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.runs import run_of
 from bayesmc.engines.particles.smoothing import Backwards, backwards
+from bayesmc.engines.refusals import check_keep, no_past_of_objects, not_with_objects
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.randomness import seed_sequence
@@ -82,7 +84,7 @@ class ParticleFilter(FilterEngine):
         where it names what is missing (an observation, or the slice before slice 0): there the node's own
         density is drawn from. A detector mixed with the transition is a ``Mixture`` of both. ``"optimal"``
         derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
-        is seen is affine in them; else what is seen is made linear, or its log density quadratic, at each
+        is seen is affine in them; else what is seen is linearised, or its log density quadratic, at each
         particle, mixtures of Gaussians component by component, and a tenth of the particles is drawn from
         their own densities. Hidden finite nodes are drawn from their own densities; ``explain`` says what
         guides each node, and why any is not guided. With any proposal vectors are seen whole or not at all.
@@ -230,7 +232,7 @@ class ParticleFilter(FilterEngine):
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         require_functions(self, _FUNCTIONS)
-        common = super().refusal(problem)
+        common = super().refusal(problem) or not_with_objects(self, problem)
         if common is not None:
             return common
         asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
@@ -240,8 +242,10 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        if why := not_delayed(self.delay, asked) or marginal.not_of_the_past(
-            self, problem, asked.what
+        if why := (
+            no_past_of_objects(problem, asked.what, asked.keep, self.delay)
+            or not_delayed(self.delay, asked)
+            or marginal.not_of_the_past(self, problem, asked.what)
         ):
             return why
         sums = marginal.endless_sums(self, problem) if asked.what == "smooth" else ()
@@ -276,10 +280,7 @@ class ParticleFilter(FilterEngine):
         progress: bool | None = None,
         checkpoint: RunFile | None = None,
     ) -> FilteredParticles:
-        if keep not in (None, "particles"):
-            raise ValueError(
-                f'keep={keep!r}: give "particles", or None for answers of constant size'
-            )
+        check_keep(problem, keep, self.delay)
         if not self._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
@@ -373,6 +374,7 @@ class ParticleFilter(FilterEngine):
         return bound(self._sized(START), belief, dbn, slices)
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
+        check_parts(self, row.seen)
         if self.marginalize is None and not isinstance(belief.made_by, FilterStep):
             warn_of_what_is_not_guided(self, slices, row.seen)
         found = absorbed(self._sized(START), belief, slices, row)

@@ -111,6 +111,10 @@ class KLD:
                     f"KLD: widths= names {name!r}, which the next slice does not read; bins are those of "
                     f"{', '.join(map(repr, interface))}"
                 )
+            if model[name].is_object:
+                raise ModelError(
+                    f"KLD: {name!r} holds objects, and bins are of numbers; leave it out of widths="
+                )
             size = np.size(width)
             if size not in (1, math.prod(model[name].value_shape)):
                 raise ModelError(

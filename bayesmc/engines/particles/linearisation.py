@@ -1,12 +1,12 @@
 """A block of hidden numbers as a Gaussian, given the slice before and what was seen below the block.
 
-Means are made linear where the block is expected (central differences) and moments are taken there: an
+Means are linearised where the block is expected (central differences) and moments are taken there: an
 extended Kalman update from a known start, one for every particle. What is seen and is not Gaussian (a count,
 a failure time) corrects that by the derivatives of its log density (``curved``). It gives a density to draw
 the block from and the density of what was seen. Mixtures of Gaussians make a block a mixture, of one such
 belief for each combination of components. Which nodes make a block is not decided here (``optimal``).
 
-Nodes on a circle count differences the short way round.
+Differences of nodes on a circle are wrapped.
 
 References
 ----------
@@ -30,6 +30,7 @@ from bayesmc.engines.particles.looking import (
     NUMBERS,
     by_moments,
     density_at,
+    elements_seen,
     has_moments,
     moments,
     numbers_of,
@@ -41,7 +42,7 @@ from bayesmc.network.forward import Pass, summed
 
 #: balances the rounding of a central difference against its curvature
 _STEP = float(np.finfo(float).eps ** (1 / 3))
-#: times that means are made linear anew, where the block is now expected
+#: times that means are linearised anew, where the block is now expected
 _TURNS = 5
 #: standard deviations by which the block may still have moved in the last of them
 _STILL = 0.01
@@ -75,7 +76,7 @@ class LookAhead:
     block : sequence of str
         Normal and MvNormal nodes, parents first.
     seen : dict
-        Node that depends on the block -> mask of the elements seen, shape ``plates``; None for all.
+        Node that depends on the block -> what is seen of it (``mask_of``).
     order : sequence of str
         Nodes of the slice, parents first.
     apart : tuple of str
@@ -104,12 +105,10 @@ class LookAhead:
         self.sizes = [numbers_of(model, n, apart) for n in self.block]
         self.total = sum(self.sizes)
         self.between = {n: _between(model, order, block, n) for n in (*self.block, *self.seen)}
+        masks = {n: _over_events(m, model[n]) for n, m in self.seen.items() if m is not None}
         self.masks = {
-            n: self._flat(
-                model[n], np.broadcast_to(_over_events(m, model[n]), model[n].value_shape)
-            )
-            for n, m in self.seen.items()
-            if m is not None
+            n: self._flat(model[n], np.broadcast_to(m, model[n].value_shape))
+            for n, m in masks.items()
         }
         self.straight = [
             n
@@ -133,7 +132,7 @@ class LookAhead:
     def believed(self, state: Pass) -> Belief:
         """The block given its parents, whose values are in place, and what was seen.
 
-        Means that are not affine are made linear again where the block is then expected (Gauss-Newton steps).
+        Means that are not affine are linearised again where the block is then expected (Gauss-Newton steps).
         """
         shape = (*state.batch, *self.lead)
         mean, cov = np.zeros((*shape, self.total)), np.zeros((*shape, self.total, self.total))
@@ -208,7 +207,7 @@ class LookAhead:
             weights = np.broadcast_to(dist.weights, (*dist.batch_shape, dist.weights.shape[-1]))
             with np.errstate(divide="ignore"):
                 log = np.log(weights[..., choice])
-            mask = self.seen.get(name)
+            mask = elements_seen(self.seen.get(name), node, np.any)
             if mask is not None:
                 log = np.where(mask, log, 0.0)
             total = total + summed(
@@ -237,8 +236,9 @@ class LookAhead:
             batch = (len(points), *state.batch)
             for name in self.curved:
                 values = self._computed(state, name, full)
-                log = density_at(self.model, name, values, self.seen[name])
                 node = self.model[name]
+                mask = elements_seen(self.seen[name], node)
+                log = density_at(self.model, name, values, mask)
                 log = np.broadcast_to(log, batch + node.plate_shape)
                 total = total + summed(log, node, self.apart)
             return total
@@ -253,7 +253,7 @@ class LookAhead:
         return Belief(moved, cov, log_before + log)
 
     def _updated(self, state: Pass, name: str, belief: Belief, point: np.ndarray) -> Belief:
-        """The belief given the value of one seen node, made linear at a point."""
+        """The belief given the value of one seen node, linearised at a point."""
         mean, cov, log_density = belief
         node = self.model[name]
         size = numbers_of(self.model, name, self.apart)
@@ -432,7 +432,7 @@ def _settled(cov: np.ndarray) -> np.ndarray:
 
 
 def _over_events(mask: np.ndarray, node: CompiledNode) -> np.ndarray:
-    return mask.reshape(mask.shape + (1,) * len(node.event_shape))
+    return mask.reshape(mask.shape + (1,) * (len(node.value_shape) - mask.ndim))
 
 
 def _root(cov: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ from bayesmc.distributions import (
     WrappedNormal,
 )
 from bayesmc.errors import BayesmcError
-from bayesmc.network import Model
+from bayesmc.network import CompiledNode, Model, Observed
 
 #: states of a finite node that a mean and a variance describe
 _TWO = 2
@@ -157,6 +157,23 @@ def once(model: Model, key: Any, find: Callable[[], Any]) -> Any:
     if key not in kept:
         kept[key] = find()
     return kept[key]
+
+
+def mask_of(seen: Observed) -> np.ndarray | None:
+    """What is seen of a node: None for all, a mask of elements, or of components where some miss a few."""
+    if seen.parts is None:
+        return seen.mask
+    assert seen.mask is not None
+    return np.asarray(seen.mask[..., None] | seen.parts)
+
+
+def elements_seen(
+    mask: np.ndarray | None, node: CompiledNode, which: Callable[..., Any] = np.all
+) -> np.ndarray | None:
+    """Elements of which all components are seen, or any with ``np.any``, by what ``mask_of`` says."""
+    if mask is None or mask.ndim == len(node.plates):
+        return mask
+    return np.asarray(which(mask, axis=tuple(range(len(node.plates), mask.ndim))))
 
 
 def density_at(

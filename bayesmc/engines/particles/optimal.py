@@ -26,7 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import Row, Slices
-from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
+from bayesmc.engines.particles.looking import (
+    NUMBERS,
+    mask_of,
+    once,
+    why_not_drawn,
+    why_not_looked_at,
+)
 from bayesmc.engines.particles.mixtures import look_ahead
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import Model, Observed
@@ -59,7 +65,7 @@ class OptimalPlan(SlicePlan):
     def _looking(self, row: Row, group: Group, order: Sequence[str]) -> list[Step]:
         """Draw a block, and weigh it by p/q."""
         model = self.slices.model(row.t)
-        seen = {n: row.seen[n].mask for n in group.seen}
+        seen = {n: mask_of(row.seen[n]) for n in group.seen}
         affine = is_affine(model, group)
         look = look_ahead(model, group.block, seen, order, self.apart, affine)
         between = {n for name in group.block for n in look.between[name]}

@@ -143,6 +143,25 @@ def check_together(engine: Any) -> None:
         )
 
 
+def refused_parts(engine: Any, seen: Mapping[str, Observed]) -> str | None:
+    """Why vectors seen in part are not taken: functions that are given would read what is not there."""
+    looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(engine, o)]
+    looks = [o for o in looks if not isinstance(getattr(engine, o), str)]
+    return refuse_parts(seen, f"ParticleFilter({looks[0]}=)") if looks else None
+
+
+def check_parts(engine: Any, seen: Mapping[str, Observed]) -> None:
+    """Refuse one row with such vectors.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    parts = refused_parts(engine, seen)
+    if parts is not None:
+        raise UnsupportedError(parts)
+
+
 def refused(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:
     """Why the filter does not answer, beside what all filters refuse; None where it does.
 
@@ -151,8 +170,7 @@ def refused(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     ModelError
         From the proposals that are ``asked`` for.
     """
-    looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(engine, o)]
-    parts = refuse_parts(problem.series.observed, f"ParticleFilter({looks[0]}=)") if looks else None
+    parts = refused_parts(engine, problem.series.observed)
     if parts is not None:
         return parts
     apart = plates_apart(problem.slices)

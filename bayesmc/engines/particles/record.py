@@ -37,8 +37,8 @@ from bayesmc.engines.particles.written import (
 )
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
-from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
+from bayesmc.results.series import SeriesPosterior, without_labels
 
 #: slices that are written together, at most, and those that are though half as many would stay in cache
 TOGETHER, FEW = 100, 6
@@ -390,7 +390,8 @@ class FilteredParticles(SeriesPosterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
-        return self._kept("quantile").quantile(self._node(name).name, q)
+        node = without_labels(self._node(name), "quantile")
+        return self._kept("quantile").quantile(node.name, q)
 
     def _held_laws(self, name: str) -> Any:
         return self._kept("hdi, mode, cdf or entropy").laws(name)

@@ -427,7 +427,7 @@ class _Spare:
 
     def put(self, *arrays: np.ndarray) -> None:
         for array in arrays:
-            if array.flags.owndata and array.flags.writeable:
+            if array.flags.owndata and array.flags.writeable and array.dtype != object:
                 self._free.setdefault((array.shape, array.dtype), []).append(array)
 
 

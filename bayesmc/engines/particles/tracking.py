@@ -67,7 +67,8 @@ class Tracker:
         #: large arrays of blocks, which are nobody's once they have been followed
         self.room: dict[Any, np.ndarray] = {}
         self.layout = step.layout
-        nodes = [step.slices.later[n] for n in step.slices.interface]
+        read = map(step.slices.later.__getitem__, step.slices.interface)
+        nodes = [n for n in read if not n.is_object]
         self.sight = Sight([n for n in nodes if n.name not in step.too_wide], step.layout)
         finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
         self.scouting = step.scouting() if finite else None
@@ -75,8 +76,7 @@ class Tracker:
         compass = Compass([n for n in nodes if n.name not in step.integrated], step.layout)
         self.compass = compass if compass.nodes and not blind else None
         # after a first stage, what a family should have is not what its weight says
-        schemes = (stratified, systematic, ssp)
-        self.steady = step.scheme in schemes or step.first_stage is not None
+        self.steady = step.scheme in (stratified, systematic, ssp) or step.first_stage is not None
         plain = self.scouting is None and not step.integrated
         self._is_plain = self.steady and not step.layout.apart and plain
 

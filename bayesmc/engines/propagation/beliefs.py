@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import sparse
+import scipy
 
 from bayesmc.factors.families import Family
 from bayesmc.factors.tilted import log_integral, log_sum
@@ -45,8 +45,10 @@ def components(count: int, groups: Iterable[np.ndarray]) -> np.ndarray:
     if not count or not ends:
         return np.arange(count)
     one, two = (np.concatenate(e) for e in zip(*ends, strict=True))
-    links = sparse.coo_array((np.ones(len(one), dtype=bool), (one, two)), shape=(count, count))
-    found = sparse.csgraph.connected_components(links, directed=False)[1]
+    links = scipy.sparse.coo_array(
+        (np.ones(len(one), dtype=bool), (one, two)), shape=(count, count)
+    )
+    found = scipy.sparse.csgraph.connected_components(links, directed=False)[1]
     _, where, found = np.unique(found, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(where))[found]
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import optimize, sparse
+import scipy
 
 from bayesmc.engines.propagation.batch import Batch
 from bayesmc.engines.propagation.beliefs import Beliefs
@@ -97,9 +97,9 @@ def _fits(bounds: Sequence[Bounds]) -> bool:
         return True
     last = len(places)
     columns = [last if c < 0 else c for c in columns]
-    matrix = sparse.csr_array((entries, (rows, columns)), shape=(count, last + 1))
+    matrix = scipy.sparse.csr_array((entries, (rows, columns)), shape=(count, last + 1))
     cost = np.zeros(last + 1)
     cost[-1] = -1.0
     limits = [(None, None)] * last + [(None, 1.0)]
-    found = optimize.linprog(cost, matrix, np.array(sides), bounds=limits, method="highs")
+    found = scipy.optimize.linprog(cost, matrix, np.array(sides), bounds=limits, method="highs")
     return not found.success or bool(found.x[-1] > _ROOM)

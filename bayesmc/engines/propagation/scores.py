@@ -18,7 +18,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from scipy import interpolate, special
+from scipy import special
 
 from bayesmc import distributions as d
 from bayesmc.distributions import Distribution
@@ -135,6 +135,8 @@ class Curve:
         values = exact(knots)
         if not np.isfinite(values).all():
             return
+        from scipy import interpolate  # takes long to load
+
         spline = interpolate.make_interp_spline(knots, values, k=7)
         pieces = interpolate.PPoly.from_spline(spline)
         between = knots[(np.abs(knots) < _REACH - _MARGIN)] + 0.5 * _STEP

@@ -70,7 +70,7 @@ class SwitchingEngine(FilterEngine):
     Attributes
     ----------
     linearize : bool
-        Whether functions that are not affine are made linear.
+        Whether functions that are not affine are linearised.
     max_modes : int
         Modes above which it refuses.
     """

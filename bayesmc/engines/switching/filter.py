@@ -44,7 +44,7 @@ class SwitchingKalmanFilter(SwitchingEngine):
     linearize : bool
         Makes functions that are not affine linear at each mode's mean by their derivatives, as
         ``ExtendedKalmanFilter`` does; otherwise templates with such are refused. Readings that are angles
-        (``WrappedNormal``, ``VonMises``) count the short way round; hidden angles are refused, and angles
+        (``WrappedNormal``, ``VonMises``) have wrapped residuals; hidden angles are refused, and angles
         that are missing in some row.
     max_modes : int
         Modes above which it refuses.
@@ -129,12 +129,26 @@ class SwitchingKalmanFilter(SwitchingEngine):
         queries: Queries | None = None,
         progress: bool | None = None,
     ) -> SwitchingSeries:
+        others = "ExpectationPropagation() or ParticleFilter(particles)"
+        return self.smoothed(problem, others, lag=lag, queries=queries, progress=progress)
+
+    def smoothed(
+        self,
+        problem: SeriesProblem,
+        others: str,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> SwitchingSeries:
+        """What ``smooth`` gives; ``others`` are engines that its warning names."""
         run = self._run(problem)
         with Progress(problem.steps, self.label, progress) as bar, quiet():
             filtered, increments = run.forward(partial(bar.advance, 1))
             found = run.smoothed(filtered, lag)
             both = run.whole(filtered), run.whole(found)
-        warn_where_lost(run.data.layouts[0], *both, run.last_rows, run.data.series.start)
+        first = run.data.layouts[0], *both, run.last_rows, run.data.series.start
+        warn_where_lost(*first, others)
         kind = "smooth" if lag is None else "fixed-lag"
         return run.answers(kind, found, increments, queries)
 

@@ -93,7 +93,12 @@ def smoothed_back(
 
 
 def warn_where_lost(
-    layout: Layout, filtered: Mixture, found: Mixture, last: np.ndarray, start: int
+    layout: Layout,
+    filtered: Mixture,
+    found: Mixture,
+    last: np.ndarray,
+    start: int,
+    others: str,
 ) -> None:
     """Warn where a gap follows and smoothing has widened a belief by more than half.
 
@@ -106,6 +111,10 @@ def warn_where_lost(
         Of all unknown numbers, time first.
     last : ndarray
         See ``last_rows``.
+    start : int
+        The slice of the first row.
+    others : str
+        Engines to name that may do better.
 
     Warns
     -----
@@ -124,10 +133,9 @@ def warn_where_lost(
     warnings.warn(
         f"smooth: in slice {start + t} the standard deviation of {node!r} is {growth.max():.2g} times the "
         "filtered one; rows are missing there, over which Kim's smoother loses which modes went with which "
-        "numbers, and its answers about slices before and in such gaps are too wide: use "
-        "ExpectationPropagation() or ParticleFilter(particles)",
+        f"numbers, and its answers about slices before and in such gaps are too wide: use {others}",
         EngineWarning,
-        stacklevel=4,
+        stacklevel=6,
     )
 
 

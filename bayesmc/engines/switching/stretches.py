@@ -125,7 +125,7 @@ class Stretch:
         factor : ndarray, shape (kinds or pairs, *lead, n_prev, n_prev)
         """
         if self.rule is not None:
-            return self._made_linear(k, pattern, by_kind, mean, factor)
+            return self._linearised(k, pattern, by_kind, mean, factor)
         offset, moves, noise = self.chosen(k, pattern, by_kind)
         c = mean.shape[-1]
         rows = np.empty((*mean.shape[:-1], offset.shape[-1], c + noise.shape[-1]))
@@ -381,10 +381,10 @@ class Stretch:
         whole = np.broadcast_shapes(*(p.shape[1:] for p in parts))
         return np.concatenate([np.broadcast_to(p, (1, *whole)) for p in parts])
 
-    def _made_linear(
+    def _linearised(
         self, k: int, pattern: Pattern, by_kind: bool, mean: np.ndarray, factor: np.ndarray
     ) -> Expected:
-        """One after the other, each made linear at its own mean."""
+        """One after the other, each linearised at its own mean."""
         assert self.rule is not None
         layout = self.layout
         found: list[tuple[np.ndarray, np.ndarray] | None] = []

@@ -17,7 +17,9 @@ from bayesmc.distributions import Categorical, MvNormal, Normal
 from bayesmc.testing.makers.linear_dbns import LinearMaker, LinearSeries, named
 
 
-def random_switching_dbn(seed: int, difference: float = 1.0) -> LinearSeries:
+def random_switching_dbn(
+    seed: int, difference: float = 1.0, mean: Callable[[Any], Any] | None = None
+) -> LinearSeries:
     """A random switching template and a series of 3 or 4 rows.
 
     Parameters
@@ -25,6 +27,9 @@ def random_switching_dbn(seed: int, difference: float = 1.0) -> LinearSeries:
     seed : int
     difference : float
         How much modes differ; with 0 they make no difference to any number.
+    mean : callable, optional
+        Goes around all means: with one that gives back what it is given, and does not look so, means are
+        affine and are not known to be.
 
     Examples
     --------
@@ -32,7 +37,7 @@ def random_switching_dbn(seed: int, difference: float = 1.0) -> LinearSeries:
     >>> random_switching_dbn(3).dbn["mode"].is_discrete
     True
     """
-    return _SwitchingMaker(seed, difference).made()
+    return _SwitchingMaker(seed, difference, mean).made()
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -41,8 +46,11 @@ def random_switching_dbn(seed: int, difference: float = 1.0) -> LinearSeries:
 class _SwitchingMaker(LinearMaker):
     """Declares modes first; every mean and scale may depend on them."""
 
-    def __init__(self, seed: int, difference: float) -> None:
+    def __init__(
+        self, seed: int, difference: float, mean: Callable[[Any], Any] | None = None
+    ) -> None:
         super().__init__(seed, 2.0)
+        self.mean = mean
         self.difference = difference
         self.steps = int(self.rng.integers(3, 5))
         if self.kind in ("joint", "both"):  # one mode for all elements, or histories are too many
@@ -108,12 +116,21 @@ class _SwitchingMaker(LinearMaker):
             given = dict(zip(parents, values, strict=True))
             found = plain([given[p] for p in linear])
             for mode, gain, offset in zip(modes, gains, offsets, strict=True):
-                scale, shift = gain[given[mode]], offset[given[mode]]
+                scale, shift = (self._picked(a, given[mode]) for a in (gain, offset))
                 found = found * (scale[..., None] if size else scale)
                 found = found + (shift[..., None] if size else shift)
-            return found
+            return found if self.mean is None else self.mean(found)
 
         return total
+
+    def _picked(self, table: np.ndarray, mode: Any) -> Any:
+        """The entry of a mode; where means are to be followed, in operations that can be."""
+        if self.mean is None:
+            return table[mode]
+        chosen = [np.where(mode == k, 1.0, 0.0) for k in range(len(table))]
+        if table.ndim > 1:
+            chosen = [c[..., None, None] for c in chosen]
+        return sum(c * entry for c, entry in zip(chosen, table, strict=True))
 
     def _function(
         self, name: str, parents: tuple[str, ...], scale: float | None = None
@@ -130,6 +147,6 @@ class _SwitchingMaker(LinearMaker):
             0.5 * self.difference * self.rng.normal(size=self.modes[parents[at]])
         )
         if not size:
-            return lambda *values: Normal(terms(values), spreads[values[at]])
+            return lambda *values: Normal(terms(values), self._picked(spreads, values[at]))
         covs = spreads[:, None, None] ** 2 * np.eye(size)
-        return lambda *values: MvNormal(terms(values), covs[values[at]])
+        return lambda *values: MvNormal(terms(values), self._picked(covs, values[at]))

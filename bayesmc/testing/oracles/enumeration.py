@@ -27,7 +27,7 @@ from bayesmc.errors import (
 from bayesmc.network import BayesNet, CompiledNode, Model, Observed, Problem, pose
 from bayesmc.network.forward import refuse_bare
 from bayesmc.randomness import seed_sequence
-from bayesmc.results.posterior import circular_variance
+from bayesmc.results.statistics import circular_variance
 
 #: normal scores between which a continuous node is integrated: 8e-11 of the mass lies outside
 _REACH = 6.5

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.special
 
 from bayesmc.errors import QueryError, UnsupportedError
-from bayesmc.results.posterior import near
+from bayesmc.results.statistics import near
 from bayesmc.testing.oracles.enumeration import Enumerated
 from bayesmc.testing.posteriors.samples import Average, Draws
 from bayesmc.testing.verdict import Comparison

@@ -24,8 +24,6 @@ from bayesmc.factors.named import connected
 #: are integrated out, and up to which "auto" does so
 MOST_STATES, MOST_NUMBERS = 1024, 1 << 14
 AUTO_STATES, AUTO_NUMBERS = 256, 1 << 10
-#: how it is said that Kalman filters have a node that depends on a finite one
-MET = "and a Kalman filter takes it in"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +118,14 @@ class Fault(NamedTuple):
         A sentence.
     is_size : bool
         Tables would be too large.
+    is_filtered : bool
+        A Kalman filter takes in what depends on them.
     """
 
     nodes: tuple[str, ...]
     reason: str
     is_size: bool = False
+    is_filtered: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,7 +281,8 @@ def _fault(
         if name in variables:
             continue
         if name in apart_from:
-            return Fault(others, f"{name!r} depends on it, {MET}")
+            reason = f"{name!r} depends on it, and a Kalman filter takes it in"
+            return Fault(others, reason, is_filtered=True)
         if name not in seen and name in read:
             return Fault(others, f"{name!r}, which is sampled, depends on it")
     for (

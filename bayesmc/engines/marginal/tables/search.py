@@ -43,7 +43,7 @@ def found_plan(
     apart_from: Collection[str],
     static: Mapping[str, np.ndarray],
 ) -> tuple[TablePlan | None, dict[str, str]]:
-    """What ``"auto"`` integrates out, and why other finite nodes are not.
+    """What ``"auto"`` integrates out, and why other finite nodes are not, but for those that numbers need.
 
     Parameters
     ----------
@@ -72,7 +72,10 @@ def found_plan(
         out = _closed(slices, names, first)
         for name in out:
             by = f"{first[0]!r}, which is sampled, depends on it"
-            why[name] = found.reason if name in first else by
+            if name not in first:
+                why[name] = by
+            elif not found.is_filtered:
+                why[name] = found.reason
         if found.is_size and len(found.nodes) > 1:
             why[first[0]] += "; sampling it leaves the smallest tables"
         names = [n for n in names if n not in out]
