@@ -261,10 +261,13 @@ def _run_saved(
 
 
 def _checked(engine: Any) -> Any:
-    if (
-        isinstance(engine, Laplace) and engine.is_standard
-    ):  # the method has its name from the same man
-        return LaplaceApproximation()
+    if isinstance(engine, Laplace):  # the method has its name from the same man
+        if engine.is_bare:
+            return LaplaceApproximation()
+        raise TypeError(
+            f"engine={engine!r} is not an engine but a distribution; Laplace's method is "
+            "engine=bmc.LaplaceApproximation()"
+        )
     if isinstance(engine, type):
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"

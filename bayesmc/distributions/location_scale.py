@@ -64,10 +64,14 @@ class Laplace(LocationScale):
     (-2.3863, 8.0)
     """
 
-    @property
-    def is_standard(self) -> bool:
-        """Whether it is one number about 0 of scale 1."""
-        return not self.batch_shape and float(self.loc) == 0.0 and float(self.scale) == 1.0
+    #: whether it was made of no parameters at all, as where the method of that name is meant
+    is_bare: bool = False
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        found = super().__new__(cls, *args, **kwargs)
+        if isinstance(found, Laplace):  # of traced parameters it is none
+            found.is_bare = not (args or kwargs)
+        return found
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.laplace(size=shape))

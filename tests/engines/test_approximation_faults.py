@@ -15,7 +15,7 @@ import bayesmc as bmc
 from bayesmc.distributions.far_quantiles import beta_lower, gamma_lower, gamma_upper
 from bayesmc.engines.approximate.check import log_joint, pareto_smoothed
 from bayesmc.engines.propagation.scores import NormalScores
-from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import ConvergenceWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.expression.trace import _starred
 from bayesmc.network import pose
 
@@ -194,6 +194,96 @@ def test_noise_too_small_to_tell_is_named() -> None:
     for engine in (EP(), bmc.LaplaceApproximation()):
         with pytest.raises(UnsupportedError, match="1e-08.*rounding|rounding.*1e-08"):
             bmc.infer(net, {"y": 1.5}, engine=engine)
+
+
+@pytest.mark.parametrize("far", [1e7, 1e9])
+def test_evidence_does_not_depend_on_where_numbers_are_counted_from(far: float) -> None:
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("a", bmc.Normal(far, 100.0))
+    net.add("y", lambda a: bmc.Normal(a, 1.0), plates="i")
+    posterior = bmc.infer(net, {"y": far + np.array([4.0, 5.0, 6.0])}, engine=EP())
+    assert abs(posterior.log_marginal_likelihood + 8.912558554659775) < 1e-8
+    assert abs(posterior.mean("a") - far - 4.999833338888704) < 1e-6
+    assert abs(posterior["a"].mean() - far - 5.0) < 0.1
+
+
+def test_factors_move_along_with_where_numbers_are_counted_from() -> None:
+    """A probit, quadrature, a comparison and a mixture: what is told does not depend on the place."""
+    found = []
+    for far in (0.0, 4.5e6):
+        net = bmc.BayesNet(plates={"i": 3})
+        net.add("x", bmc.StudentT(4.0, far, 10.0))
+        net.add("b", bmc.Normal(0.0, 0.1))
+        net.add("z", bmc.Bernoulli(0.4))
+        net.add("y", lambda x, b, z: bmc.Normal(x + b + 2.0 * z, 0.5), plates="i")
+        net.add("p", lambda x, far=far: bmc.Bernoulli(special.ndtr(x - far)))
+        net.add("q", lambda x, far=far: bmc.Bernoulli(special.expit(x - far - 1.0)))
+        net.add("c", lambda x, b, far=far: bmc.Bernoulli(x > far + 10.0 * b))
+        seen = {"y": far + np.array([1.0, 1.5, 0.5]), "p": 1, "q": 0, "c": 1}
+        posterior = bmc.infer(net, seen, engine=EP())
+        moments = [posterior.mean("x") - far, posterior.std("x"), posterior.mean("z")]
+        found.append([posterior.log_marginal_likelihood, *moments])
+    np.testing.assert_allclose(*found, atol=1e-7)
+
+
+# ---- what has no answer -------------------------------------------------------------------------
+
+
+def test_equal_readings_of_a_scale_are_refused_or_told() -> None:
+    """Six of them leave the density of the scale no integral."""
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("m", bmc.Normal(0.0, 3.0))
+    net.add("s", bmc.HalfNormal(2.0))
+    net.add("y", lambda m, s: bmc.Normal(m, s), plates="i")
+    with pytest.raises(UnsupportedError, match="node 's' runs off"):
+        bmc.infer(net, {"y": np.ones(6)}, engine=bmc.MeanField(restarts=1), rng=0)
+    with pytest.warns(ConvergenceWarning, match="6 factors have no integral.*all equal"):
+        bmc.infer(net, {"y": np.ones(6)}, engine=EP())
+    near = bmc.infer(net, {"y": 1.0 + 1e-9 * np.arange(6)}, engine=bmc.MeanField(restarts=1), rng=0)
+    assert 1e-10 < near.mean("s") < 1e-7  # small, and what the readings say
+
+
+def test_errors_say_which_engine_was_asked() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.5))
+    net.add("b", lambda a: bmc.Bernoulli(np.where(a == 1, 1.0, 0.0)))
+    net.add("c", lambda a: bmc.Bernoulli(np.where(a == 1, 0.0, 1.0)))
+    for engine in (EP(), bmc.AssumedDensity()):
+        with pytest.raises(ZeroProbabilityError, match=f"^{type(engine).__name__}: the evidence"):
+            bmc.infer(net, {"b": 1, "c": 1}, engine=engine)
+
+
+# ---- answers that agree -------------------------------------------------------------------------
+
+
+def test_covariances_by_draws_have_the_variances_that_are_told() -> None:
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("m", bmc.Normal(0.0, 3.0))
+    net.add("s", bmc.HalfNormal(2.0))
+    net.add("y", lambda m, s: bmc.Normal(m, s), plates="i")
+    posterior = bmc.infer(net, {"y": [1.0, 2.0, np.nan, 4.0, 0.0, 1.0]}, engine=EP(), rng=0)
+    found = posterior.cov("m", "y")
+    assert found[0, 0] == posterior.var("m")
+    np.testing.assert_allclose(found.diagonal()[1:], posterior.var("y"), rtol=1e-12, atol=1e-28)
+    assert np.linalg.eigvalsh(found)[0] > -1e-12
+
+
+def test_what_was_seen_and_what_is_next_to_certain_has_not_moved() -> None:
+    part = bmc.BayesNet(plates={"i": 3})
+    part.add("m", bmc.Normal(0.0, 3.0))
+    part.add("y", lambda m: bmc.Normal(m, 1.0), plates="i")
+    states = bmc.BayesNet(plates={"i": 4})
+    states.add("z", bmc.Bernoulli(0.5), plates="i")
+    states.add("y", lambda z: bmc.Normal(z, 0.12), plates="i")
+    for net, seen, rows in (
+        (part, {"y": [1.0, np.nan, 5.3]}, 2),
+        (states, {"y": [1.0, 0.1, 0.01, 0.4], "z": [1, np.nan, np.nan, np.nan]}, 3),
+    ):
+        for engine in (EP(), bmc.MeanField()):
+            check = bmc.infer(net, seen, engine=engine, rng=0).check(rng=0)
+            assert check.ok and check.moved < 0.1 and len(check._rows) == rows
+            assert "plain answers are near" in str(check)
+            assert "regions that the approximation never reaches" in str(check)
 
 
 # ---- signatures ---------------------------------------------------------------------------------

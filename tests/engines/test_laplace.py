@@ -345,8 +345,11 @@ def test_the_short_name_and_inputs() -> None:
     assert first.mean("rate") == second.mean("rate")
     assert first.mean("next") == second.mean("next")
     assert isinstance(bmc.Laplace(), bmc.Distribution)
-    with pytest.raises(TypeError, match="is not an engine"):
-        bmc.infer(net, evidence, inputs={"hours": 4.0}, engine=bmc.Laplace(1.0, 2.0))
+    for distribution in (bmc.Laplace(1.0, 2.0), bmc.Laplace(0, 1), bmc.Laplace(scale=1.0)):
+        with pytest.raises(TypeError, match="is not an engine.*LaplaceApproximation"):
+            bmc.infer(net, evidence, inputs={"hours": 4.0}, engine=distribution)
+    assert pickle.loads(pickle.dumps(bmc.Laplace())).is_bare
+    assert not pickle.loads(pickle.dumps(bmc.Laplace(0.0))).is_bare
 
 
 def test_the_same_seed_the_same_draws_and_the_mode_whatever_the_seed() -> None:

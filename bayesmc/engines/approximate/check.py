@@ -19,7 +19,7 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,8 +43,26 @@ _EQUAL = 1e-7
 _FINITE = 0.5
 #: share of a standard deviation up to which answers are near
 _NEAR = 0.15
+#: root of how many draws in a rare state tell its deviation to a part of that
+_COUNTED = 10.0
 #: rows of the summary
 _ROWS = 12
+
+
+class _Row(NamedTuple):
+    """A scalar: plain and corrected mean, the error of this, both deviations, and how far both have moved.
+
+    ``wider`` is the share by which the deviation changed; ``moved`` is in corrected deviations.
+    """
+
+    name: str
+    plain: float
+    found: float
+    error: float
+    before: float
+    after: float
+    wider: float
+    moved: float
 
 
 class CheckedPosterior(DrawsPosterior):
@@ -97,7 +115,8 @@ class Check:
     @property
     def moved(self) -> float:
         return max(
-            (abs(row[-1]) if np.isfinite(row[-1]) else np.inf for row in self._rows), default=0.0
+            (abs(row.moved) if np.isfinite(row.moved) else np.inf for row in self._rows),
+            default=0.0,
         )
 
     @property
@@ -115,13 +134,13 @@ class Check:
         words = "right within their errors"
         if not own < self.bound:
             words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
-        elif not self.k < self.bound:
-            words += ", if nothing lies where no draw went"
         lines = [
             f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
             f"own coordinates (made in {self.approximation.coordinates})",
             f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {self._plain_words()}",
             f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
+            "neither k nor the errors tell of regions that the approximation never reaches: other modes, "
+            "states with numbers far off",
         ]
         plain = self.approximate.log_marginal_likelihood
         if plain is not None:
@@ -145,14 +164,13 @@ class Check:
     def _plain_words(self) -> str:
         if not self.ok:
             return "not to be trusted" if self._is_settled else "of a run that did not settle"
-        spreads = (abs(row[5] / row[4] - 1.0) for row in self._rows if row[4] > 0)
-        off = max(self.moved, max(spreads, default=0.0))
+        off = max(self.moved, max((abs(row.wider) for row in self._rows), default=0.0))
         return "near" if self.k < 0.5 and off < _NEAR else "off by what is printed"
 
     @cached_property
-    def _rows(self) -> list[Any]:
-        """Scalars by how far their means moved: name, means, error, deviations, the move in these."""
-        rows: list[Any] = []
+    def _rows(self) -> list[_Row]:
+        """Hidden scalars by how far their means moved."""
+        rows: list[_Row] = []
         for name in self.posterior.names:
             node = self.posterior.model[name]
             if not self.posterior._is_free(name) or (node.domain and node.domain.labels):
@@ -165,13 +183,37 @@ class Check:
             plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
             before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
             error = np.broadcast_to(self.posterior.mcse(name), node.value_shape).ravel()
+            least = self._least_deviation(name)
+            one, two = np.maximum(before, least), np.maximum(after, least)
             with np.errstate(all="ignore"):
                 certain = np.where(np.abs(found - plain) > _EQUAL, np.inf, 0.0)
-                moved = np.where(after > _EQUAL * before, (found - plain) / after, certain)
+                moved = np.where(two > _EQUAL * one, (found - plain) / two, certain)
+                one, two = (np.maximum(sd, _COUNTED * least) for sd in (before, after))
+                wider = np.where(one > 0, two / one - 1.0, 0.0)
             labels = self.posterior._row_names(node)
-            rows += list(zip(labels, plain, found, error, before, after, moved, strict=True))
-        rows.sort(key=lambda row: -abs(row[-1]) if np.isfinite(row[-1]) else -np.inf)
+            both = zip(labels, plain, found, error, before, after, wider, moved, strict=True)
+            hidden = self._hidden(name).ravel()
+            rows += [_Row(*row) for row, is_hidden in zip(both, hidden, strict=True) if is_hidden]
+        rows.sort(key=lambda row: -abs(row.moved) if np.isfinite(row.moved) else -np.inf)
         return rows
+
+    def _hidden(self, name: str) -> np.ndarray:
+        """Which scalars of a node were not seen."""
+        shape = self.posterior.model[name].value_shape
+        problem = self.posterior.problem
+        seen = None if problem is None else problem.observed.get(name)
+        if seen is None or seen.mask is None:
+            return np.ones(shape, dtype=bool)
+        inner = (1,) * (len(shape) - seen.mask.ndim)
+        hidden = ~np.broadcast_to(seen.mask.reshape(seen.mask.shape + inner), shape)
+        return hidden if seen.parts is None else hidden & ~np.broadcast_to(seen.parts, shape)
+
+    def _least_deviation(self, name: str) -> float:
+        """What so many draws can tell of a state that is next to certain: one draw in another."""
+        domain, ess = self.posterior.model[name].domain, self.posterior.weight_ess
+        if domain is None or not ess:
+            return 0.0
+        return float(np.ptp(np.asarray(domain.numbers, dtype=float))) / float(np.sqrt(ess))
 
     def _moved(self) -> list[str]:
         """The scalars whose means moved most, in standard deviations."""
@@ -185,7 +227,7 @@ class Check:
         ]
         lines += [
             f"{n:{width}}  {a:10.4g} {b:10.4g} {e:9.2g} {c:10.4g} {d:10.4g} {m:9.2f}"
-            for n, a, b, e, c, d, m in rows[:_ROWS]
+            for n, a, b, e, c, d, _, m in rows[:_ROWS]
         ]
         if len(rows) > _ROWS:
             lines.append(f"... and {len(rows) - _ROWS} that moved less")

@@ -86,7 +86,10 @@ class ApproximatePosterior(Posterior):
         return (table * away**2).sum(axis=-1)
 
     def cov(self, *names: str) -> np.ndarray:
-        """Covariance matrix of all scalars of the named nodes, in order; of one scalar, its variance."""
+        """Covariance matrix of all scalars of the named nodes, in order; of one scalar, its variance.
+
+        Where draws answer, they tell the correlations: the diagonal is that of ``var``.
+        """
         if not names:
             raise UnknownNodeError("cov(): name at least one node")
         names = tuple(expanded(self.model, names))
@@ -94,7 +97,7 @@ class ApproximatePosterior(Posterior):
             self._numeric(name, "cov")
         found = self.approximation.covariance(*names)
         if found is None:
-            return self._drawn.cov(*names)
+            return self._rescaled(self._drawn.cov(*names), names)
         return found[0, 0] if found.size == 1 else np.array(found)
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
@@ -221,6 +224,17 @@ class ApproximatePosterior(Posterior):
         )
         stored = as_stored(problem, values)
         return DrawsPosterior(problem, self.engine, stored, (1, draws), independent=True)
+
+    def _rescaled(self, drawn: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """Covariances of draws with the variances that ``var`` tells."""
+        own = np.concatenate([np.asarray(self.var(n), dtype=float).ravel() for n in names])
+        matrix = np.reshape(drawn, (len(own), len(own)))
+        with np.errstate(all="ignore"):
+            scale = np.sqrt(own / matrix.diagonal())
+        scale = np.where(np.isfinite(scale), scale, 1.0)
+        found = matrix * scale * scale[:, None]
+        np.fill_diagonal(found, own)
+        return found[0, 0] if found.size == 1 else found
 
     def _table(self, name: str) -> np.ndarray | None:
         node = self.model[name]

@@ -205,6 +205,7 @@ class Messages:
             size = np.log(root.diagonal(0, -2, -1)).sum()
             normal, heavy = _log_densities((noise**2).sum(axis=-1), noise.shape[-1])
             own, wide = own + normal.sum(axis=-1) - size, wide + heavy.sum(axis=-1) - size
+        free += beliefs.centre
         values = {}
         for name in self.names:
             node, x = self.model[name], self._numbers.get(name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import groupby
 
 import numpy as np
@@ -12,6 +13,7 @@ import numpy as np
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.propagation.batch import Batch, Edge, Kernel
 from bayesmc.engines.propagation.beliefs import IMPOSSIBLE, Beliefs, components
+from bayesmc.engines.propagation.centring import centre_of, moved_read, moved_rows
 from bayesmc.engines.propagation.conjugate import ConjugateBatch
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.density import Read
@@ -108,6 +110,7 @@ class Assembly:
         cards = sorted({c for c, _ in self.groups})
         counts = [sum(1 for c, _ in self.groups if c == card) for card in cards]
         self.beliefs = Beliefs.of(component, cards, counts)
+        self._centre(component)
         self._clamp()
         exact = self._enter_exact()
         self.beliefs.families = self.own.fields
@@ -169,6 +172,15 @@ class Assembly:
                 shared = (read.coordinates == read.coordinates[:1]).all()
                 yield read.coordinates[:1] if shared else read.coordinates
 
+    def _centre(self, component: np.ndarray) -> None:
+        """Count coordinates from where they will end, roughly."""
+        prior = partial(_prior_draws, self.problem, self.numbers, len(component))
+        centre = centre_of(component, self.rows, self.reads, self.numbers, prior)
+        if centre.any():
+            self.rows = [moved_rows(row, centre) for row in self.rows]
+            self.reads = [moved_read(read, centre) for read in self.reads]
+            self.beliefs.centre = centre
+
     def _clamp(self) -> None:
         """Elements of partly observed finite nodes are what was seen."""
         for variable, state in self.states.items():
@@ -187,13 +199,8 @@ class Assembly:
             matrix, value = row.rows[..., :-1], row.rows[..., -1]
             self.log_scale += float(row.log_scale) - 0.5 * float(value @ value)
             found[row.name] = found.get(row.name, 0) + 1
-            at = row.coordinates
-            if not len(at):
-                continue
-            block = beliefs.blocks[beliefs.size[at[0]]]
-            c, places = beliefs.component[at[0]], beliefs.place[at]
-            np.add.at(block.precision, (c, places[:, None], places[None, :]), matrix.T @ matrix)
-            np.add.at(block.linear, (c, places), matrix.T @ value)
+            if len(row.coordinates):
+                beliefs.enter(row.coordinates, matrix, value)
         return found
 
     def _table_batches(self) -> list[Batch]:
@@ -344,7 +351,8 @@ def _begin(problem: Problem, system: System) -> None:
     beliefs = system.beliefs
     priors = [b for b in system.batches if b.k and b.is_prior]
     if priors:
-        mean, spread = _prior_draws(problem, system)
+        mean, spread = _prior_draws(problem, system.numbers, len(beliefs.size))
+        mean = mean - beliefs.centre
         for batch in priors:
             at = _global(beliefs, batch)
             middle = np.matvec(batch.weights, mean[at])
@@ -387,16 +395,17 @@ def _global(beliefs: Beliefs, batch: Batch) -> np.ndarray:
     return found
 
 
-def _prior_draws(problem: Problem, system: System) -> tuple[np.ndarray, np.ndarray]:
+def _prior_draws(
+    problem: Problem, numbers: Mapping[str, Numbers], count: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Middles and spreads of all coordinates under the prior, roughly: medians and quartiles."""
-    count = len(system.beliefs.size)
     mean, spread = np.zeros(count), np.full(count, 10.0)
     try:
         model = problem.model
-        probe = {n: model.probe[n].reshape(-1, *model[n].value_shape) for n in system.numbers}
+        probe = {n: model.probe[n].reshape(-1, *model[n].value_shape) for n in numbers}
     except (KeyError, ValueError):  # what the prior is like is not known: anything will do
         return mean, spread
-    for name, x in system.numbers.items():
+    for name, x in numbers.items():
         with np.errstate(all="ignore"):
             free = x.freed(probe[name])
         low, middle, high = np.nanquantile(free, [0.2, 0.5, 0.8], axis=0)

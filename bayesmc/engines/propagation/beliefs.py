@@ -146,6 +146,8 @@ class Beliefs:
     finite : list of Finite
     size : ndarray of int, shape (coordinates,)
         In which of ``blocks`` a coordinate is; ``component`` and ``place`` say where there.
+    centre : ndarray, shape (coordinates,)
+        From where coordinates are counted in ``blocks``; moments have it added.
     """
 
     blocks: list[Blocks]
@@ -154,6 +156,10 @@ class Beliefs:
     component: np.ndarray
     place: np.ndarray
     families: list[Conjugates] = field(default_factory=list)
+    centre: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.centre = np.zeros(len(self.size))
 
     @classmethod
     def of(cls, component: np.ndarray, cards: Sequence[int], counts: Sequence[int]) -> Beliefs:
@@ -175,6 +181,13 @@ class Beliefs:
         finite = [Finite(np.zeros((m, c))) for c, m in zip(cards, counts, strict=True)]
         return cls(blocks, finite, size, where, place)
 
+    def enter(self, coordinates: np.ndarray, matrix: np.ndarray, value: np.ndarray) -> None:
+        """Multiply ``exp(-|A x - z|^2 / 2)`` in, up to ``z' z``, exactly; of coordinates of one component."""
+        block = self.blocks[self.size[coordinates[0]]]
+        c, places = self.component[coordinates[0]], self.place[coordinates]
+        np.add.at(block.precision, (c, places[:, None], places[None, :]), matrix.T @ matrix)
+        np.add.at(block.linear, (c, places), matrix.T @ value)
+
     @property
     def log_total(self) -> float:
         gaussian = sum(b.log_total for b in self.blocks)
@@ -192,7 +205,7 @@ class Beliefs:
                 at = place[mine]
                 mean[mine] = block.mean[c, at]
                 cov[np.ix_(mine, mine)] = block.cov[c][np.ix_(at, at)]
-        return mean, cov
+        return mean + self.centre[coordinates], cov
 
     def variances(self, coordinates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and variances of some coordinates, each by itself."""
@@ -202,7 +215,7 @@ class Beliefs:
             mine = size == k
             mean[mine] = block.mean[where[mine], place[mine]]
             var[mine] = block.cov[where[mine], place[mine], place[mine]]
-        return mean, var
+        return mean + self.centre[coordinates], var
 
 
 def normalised(logs: np.ndarray) -> np.ndarray:

@@ -151,6 +151,15 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
         )
         if end.silent:
             return f"ExpectationPropagation: {_unsaid(end)}; take HamiltonianMonteCarlo or Gibbs"
+        if end.open and end.change <= float(
+            self.tolerance
+        ):  # more of the same would change nothing
+            return (
+                f"ExpectationPropagation: beliefs rest after {end.sweeps} sweeps, but {end.open} factors "
+                "have no integral with what the others say, and their messages were left as they were: the "
+                "answer is none of all factors, and the posterior may have no integral (a scale whose "
+                "readings are all equal); take Gibbs, or a prior that keeps scales from 0"
+            )
         return (
             f"ExpectationPropagation: messages have not settled after {end.sweeps} sweeps: the last one "
             f"changed a belief by {end.change:.2g} (tolerance {float(self.tolerance):.2g}){out}. Give more "

@@ -95,9 +95,7 @@ class MessageEngine(Engine):
         except ZeroProbabilityError:
             return None
         except BayesmcError as error:
-            name = type(self).__name__
-            text = str(error).removeprefix("ExpectationPropagation: ").removeprefix(f"{name}: ")
-            return f"{name}: {text}"
+            return self._named(error)
         return None
 
     def describe(self, problem: Problem) -> dict[str, str]:
@@ -141,9 +139,13 @@ class MessageEngine(Engine):
         name = type(self).__name__
         if resume is not None:
             raise UnsupportedError(f"{name}: there is nothing to go on with; give more sweeps")
-        system = _system(problem, self, again=True)
-        with marking_invalid(), np.errstate(all="ignore"):
-            end = self.passed(system, progress)
+        try:
+            system = _system(problem, self, again=True)
+            with marking_invalid(), np.errstate(all="ignore"):
+                end = self.passed(system, progress)
+        except BayesmcError as error:
+            error.args = (self._named(error), *error.args[1:])
+            raise
         doubt = self.doubt(end)
         if doubt is not None:
             warnings.warn(doubt, ConvergenceWarning, stacklevel=3)
@@ -155,6 +157,12 @@ class MessageEngine(Engine):
                 stacklevel=3,
             )
         return PropagatedPosterior.of(problem, self, system, end, seed)
+
+    def _named(self, error: BayesmcError) -> str:
+        """What an error says, by the name of this engine: parts that two of them share say the other's."""
+        name = type(self).__name__
+        text = str(error).removeprefix("ExpectationPropagation: ").removeprefix(f"{name}: ")
+        return f"{name}: {text}"
 
 
 def check_families(engine: Any) -> None:

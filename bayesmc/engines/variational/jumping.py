@@ -1,4 +1,4 @@
-"""Energies that jump at some values of a free number: climbs along gradients go past them unaware.
+"""Energies that jump at some values of a free number, or rise without end: climbs go on unaware.
 
 The points of a normal factor cross a jump without a gradient telling, and a sum over a few of them says the
 bound of another function than the one that is climbed.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.transforms import Identity, Wrapped
 from bayesmc.engines.variational.factors import State
 from bayesmc.engines.variational.free import FREE, FreeFactor
 from bayesmc.engines.variational.steps import Plan, total_of
@@ -17,6 +18,8 @@ from bayesmc.structure.jumps import jumps_between
 
 #: ways that each node is moved, and how far, in standard deviations of a draw
 _WAYS, _REACH = 24, 2.0
+#: how far from 0, and from all draws of the prior, there is no end in sight of a climb of a bounded number
+_ENDLESS = 100.0
 
 
 def refuse_jumps(plan: Plan, state: State) -> None:
@@ -81,6 +84,37 @@ def refuse_edges(plan: Plan, state: State) -> None:
                 f"MeanField: the density is zero beyond some values of node {node.name!r} (an observed "
                 "comparison, or bounds that depend on other nodes), in front of which a normal factor would "
                 "be squeezed; use ExpectationPropagation(), Gibbs() or HamiltonianMonteCarlo()"
+            )
+
+
+def refuse_endless(plan: Plan) -> None:
+    """Refuse a climb that has gone on to the edge of a node's support, as far as numbers go.
+
+    Raises
+    ------
+    UnsupportedError
+        Names the node.
+    """
+    free = plan.free
+    if free is None:
+        return
+    drawn = _drawn(plan, free, np.random.default_rng(free.size))
+    for node in free.nodes:
+        if isinstance(node.transform, Identity | Wrapped):
+            continue
+        numbers = slice(node.start, node.start + node.size)
+        away = np.abs(free.mean[numbers])
+        if len(drawn):
+            apart = np.abs(drawn[:, numbers] - free.mean[numbers]).min(axis=0)
+            away = np.minimum(away, apart)
+        if (away > _ENDLESS).any():
+            u = free.mean[numbers][away.argmax()]
+            raise UnsupportedError(
+                f"MeanField: the evidence bound goes on rising as node {node.name!r} runs off to the edge of "
+                f"its support (its free number, a logarithm, has come to {u:.3g}): the posterior has no "
+                "integral, or next to all of its mass there, as a scale has whose readings are all equal; "
+                "give the node a prior that vanishes at the edge (LogNormal, InverseGamma), or the readings "
+                "the noise of their rounding"
             )
 
 

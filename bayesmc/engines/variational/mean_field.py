@@ -16,7 +16,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
 from bayesmc.engines.variational.excluded import left_out
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
-from bayesmc.engines.variational.jumping import refuse_edges, refuse_jumps
+from bayesmc.engines.variational.jumping import refuse_edges, refuse_endless, refuse_jumps
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
 from bayesmc.engines.variational.places import other_places, told
 from bayesmc.engines.variational.plan import plan_for
@@ -187,7 +187,8 @@ class MeanField(Engine):
     Raises
     ------
     UnsupportedError
-        A density cannot be followed; a node has infinitely many states; a node has no proper factor.
+        A density cannot be followed; a node has infinitely many states; a node has no proper factor; the
+        bound rises without end.
 
     Warns
     -----
@@ -300,6 +301,7 @@ class MeanField(Engine):
                 "MeanField: independent factors put mass where the joint density is zero, wherever they "
                 "started (nodes follow from others without noise); use Exact() or Gibbs()"
             )
+        refuse_endless(plan)
         parts = tuple(part_of(f, best.state, plan.target) for f in plan.factors)
         where = "the nodes' own coordinates"
         if plan.free is not None:
