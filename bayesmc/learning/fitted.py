@@ -39,6 +39,16 @@ class Fit:
     covariance : ndarray or None
         Of the numbers in ``labels``.
     labels : tuple of str
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet(plates={"i": 4})
+    >>> net.add("m", bmc.Normal(0.0, 10.0))
+    >>> net.add("y", lambda m: bmc.Normal(m, 1.0), plates="i")
+    >>> fit = bmc.fit(net, {"y": [1.0, 2.0, 3.0, 2.0]})
+    >>> round(float(fit["m"]), 4), round(float(fit.std_errors["m"]), 4)
+    (2.0, 0.5)
     """
 
     net: Any

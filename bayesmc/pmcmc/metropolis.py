@@ -133,6 +133,6 @@ class ParticleMetropolis(ParticleEngine):
                 f"ParticleMetropolis: the log likelihood is estimated with an error of {error:.1f} (standard "
                 f"deviation), so that chains hardly move; give about particles={wanted:.0f}",
                 ConvergenceWarning,
-                stacklevel=4,
+                stacklevel=5,
             )
         return super()._posterior(problem, sampler, held, loop)

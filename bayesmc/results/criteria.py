@@ -37,6 +37,16 @@ class Elpd:
         The observed nodes.
     warning : str
         What is doubtful; empty where nothing is.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet(plates={"i": 5})
+    >>> net.add("m", bmc.Normal(0.0, 10.0))
+    >>> net.add("y", lambda m: bmc.Normal(m, 1.0), plates="i")
+    >>> posterior = bmc.infer(net, {"y": [0.1, -0.4, 0.3, 1.0, 0.2]}, engine=bmc.Gibbs(500), rng=0)
+    >>> posterior.waic().pointwise.shape
+    (5,)
     """
 
     kind: str

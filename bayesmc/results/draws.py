@@ -138,7 +138,7 @@ class DrawsPosterior(AssessedByDraws, Posterior):
         # between two states lies no value, and none is known between weighted draws
         stays = weights is not None or self.model[name].is_discrete
         method: Any = "inverted_cdf" if stays else "linear"
-        return np.quantile(flat, levels, axis=0, weights=weights, method=method)
+        return _quantiles(flat, levels, weights, method)
 
     def probabilities(self, *names: str) -> np.ndarray:
         if not names:
@@ -437,3 +437,10 @@ def _chained(values: np.ndarray, trailing: int) -> np.ndarray:
     """Values with exactly two batch axes."""
     missing = 2 - (values.ndim - trailing)
     return values.reshape((1,) * missing + values.shape) if missing > 0 else values
+
+
+def _quantiles(
+    values: np.ndarray, levels: np.ndarray, weights: np.ndarray | None, method: Any
+) -> np.ndarray:
+    """Quantiles of draws on the first axis."""
+    return np.quantile(values, levels, axis=0, weights=weights, method=method)

@@ -48,7 +48,7 @@ def claims(ratios: Any, missed: Any = 1.0) -> np.ndarray:
     --------
     >>> from bayesmc.vision import claims
     >>> claims([[8.0, 0.0], [8.0, 1.0]]).round(2).tolist()
-    [[0.67, 0.0], [0.29, 0.35]]
+    [[0.62, 0.0], [0.31, 0.35]]
     """
     ratios = as_float(ratios)
     if ratios.ndim != 2:

@@ -114,7 +114,7 @@ MUTANTS = [
     ),
     Mutant(
         "weights are forgotten in a quantile",
-        (Edit("bayesmc.results.draws:DrawsPosterior.quantile",
+        (Edit("bayesmc.results.draws:_quantiles",
               "weights=weights, method=method", 'method="linear"'),),
         estimated(median, MEDIAN, 40),
         "repeated_test, 40 runs of 2000 draws",
@@ -148,7 +148,7 @@ MUTANTS = [
     ),
     Mutant(
         "rejection by a bound that is too low",
-        (Edit("bayesmc.engines.weighted.rejection:Rejection._fill",
+        (Edit("bayesmc.engines.weighted.rejection:_unit_tried",
               "np.exp(chunk.log_weight)", "np.exp(chunk.log_weight + 1.0)"),),
         matched(mixture, SEEN, bmc.Rejection(3000)),
         "compare with exact(), 3000 draws",

@@ -105,7 +105,7 @@ MUTANTS = [
     Mutant(
         "the proposal's mean is taken instead of a draw",
         (Edit(GUIDE, "np.matvec(found.root,", "0.0 * np.matvec(found.root,"),),
-        lambda seed: unbiased(seed, False, "optimal"), BY,
+        lambda seed: unbiased(seed, False, "optimal"), BY, is_long=True,
     ),
     Mutant(
         "weights of a guided pose are without p/q",
@@ -116,7 +116,7 @@ MUTANTS = [
         "innovations have the covariance of another matrix",
         (Edit("bayesmc.engines.marginal.elements.updates:conditioned",
               "found.slopes @ prior.root,", "found.slopes,"),),
-        lambda seed: unbiased(seed, False, "optimal"), BY,
+        lambda seed: unbiased(seed, False, "optimal"), BY, is_long=True,
     ),
     Mutant(
         "a pick weighs by its own density, not by the sum over all",

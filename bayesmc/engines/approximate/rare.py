@@ -38,7 +38,8 @@ def log_of(term: Term, values: Mapping[str, np.ndarray]) -> np.ndarray:
     >>> log_of(target.terms["y"], {**target.known, "x": np.array([1.0, 20.0])}).round(4).tolist()
     [-1.841, -203.9172]
     """
-    plain = term.log(values)
+    with np.errstate(all="ignore"):
+        plain = term.log(values)
     if term.is_potential or not (plain < _RARE).any():
         return plain
     family = getattr(term.read, "result", None)
