@@ -209,9 +209,12 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
             return None
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
         if wrong is not None:
+            why = "which is sampled"
+            if wrong in problem.series.observed:
+                why = "which is sampled where its reading is missing"
             return (
                 'ParticleFilter: with marginalize=, proposal="optimal" draws finite nodes given the row, and '
-                f"{wrong!r}, which is sampled, is not finite; give proposal={{...}}, or leave it out"
+                f"{wrong!r}, {why}, is not finite; give proposal={{...}}, or leave it out"
             )
         count = 1.0
         for name in sampled:
