@@ -64,7 +64,7 @@ class Choices:
             if node.domain is None:
                 raise UnsupportedError(
                     f'ParticleFilter(marginalize=..., proposal="optimal") draws finite nodes given the row, '
-                    f"and {node.name!r}, which is sampled (a reading that is missing is, too), is not finite; "
+                    f"and {node.name!r}, which is sampled (as missing readings are), is not finite; "
                     "give proposal={...} or none"
                 )
             others = [
