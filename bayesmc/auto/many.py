@@ -21,7 +21,7 @@ from bayesmc.randomness import child, seed_sequence
 from bayesmc.results import Posterior
 from bayesmc.results.many import Posteriors
 from bayesmc.workers import check_executor, completed
-from bayesmc.workers.units import told_of_interrupt, workers_of
+from bayesmc.workers.units import gathered, told_of_interrupt, workers_of
 
 #: units of work for each worker, and questions in one at most: few enough for progress, many enough to travel
 _UNITS, _MOST = 8, 64
@@ -174,17 +174,10 @@ def _one_by_one(
         _questions_answered, shared, units, executor,
         label="questions", total=len(units), progress=progress,
     )  # fmt: skip
-    found: list[Posterior | None] = [None] * len(problems)
-    try:
-        for number, posteriors in results:
-            start = units[number][0]
-            found[start : start + len(posteriors)] = posteriors
-    except KeyboardInterrupt:
-        done = sum(one is not None for one in found)
-        if not done:
-            raise
-        told_of_interrupt("infer_many", f"{done} of {len(found)} evidence sets", InterruptWarning)
-    return Posteriors(found)
+    starts = [unit[0] for unit in units]
+    return Posteriors(
+        gathered(results, starts, len(problems), "infer_many", "{} of {} evidence sets")
+    )
 
 
 def _questions_answered(

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
-from bayesmc.errors import BayesmcError, EvidenceError, InterruptWarning
+from bayesmc.errors import BayesmcError, EvidenceError
 from bayesmc.randomness import child
 from bayesmc.results import SeriesPosterior
 from bayesmc.workers import completed
-from bayesmc.workers.units import told_of_interrupt, workers_of
+from bayesmc.workers.units import gathered, workers_of
 
 #: units of work for each worker: a slow series holds up little
 _UNITS = 8
@@ -55,19 +55,8 @@ def several(
         _series_answered, shared, units, executor,
         label="series", total=len(units), progress=progress,
     )  # fmt: skip
-    found: list[Any] = [None] * len(problems)
-    try:
-        for number, answers in results:
-            start = units[number][0]
-            found[start : start + len(answers)] = answers
-    except KeyboardInterrupt:
-        done = sum(one is not None for one in found)
-        if not done:
-            raise
-        told_of_interrupt(
-            call, f"{done} of {len(found)} series, and None for the others", InterruptWarning
-        )
-    return found
+    said = "{} of {} series, and None for the others"
+    return gathered(results, [unit[0] for unit in units], len(problems), call, said)
 
 
 # ---- private ------------------------------------------------------------------------------------

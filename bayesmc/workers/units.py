@@ -7,7 +7,7 @@ import hashlib
 import os
 import sys
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -20,7 +20,7 @@ from contextlib import suppress
 from contextvars import copy_context
 from typing import Any, NamedTuple
 
-from bayesmc.errors import WorkerError, WorkerWarning
+from bayesmc.errors import InterruptWarning, WorkerError, WorkerWarning
 from bayesmc.progress import Progress
 from bayesmc.workers.remote import Told, work
 from bayesmc.workers.travel import known_to, pack_job, packed, unpacked
@@ -133,6 +133,23 @@ def in_order(
 def told_of_interrupt(call: str, done: str, category: type[Warning]) -> None:
     """Warn that an answer rests on what was done before Ctrl-C."""
     warnings.warn(f"{call}: interrupted; the answer has {done}", category, stacklevel=4)
+
+
+def gathered(
+    results: Iterable[tuple[int, Any]], starts: Sequence[int], count: int, call: str, said: str
+) -> list[Any]:
+    """Answers of units, which come as lists, each from its start on; None for what Ctrl-C cut off."""
+    found: list[Any] = [None] * count
+    try:
+        for number, answers in results:
+            found[starts[number] : starts[number] + len(answers)] = answers
+    except KeyboardInterrupt:
+        done = sum(one is not None for one in found)
+        if not done:
+            raise
+        made = f"{call}: interrupted; the answer has {said.format(done, count)}"
+        warnings.warn(made, InterruptWarning, stacklevel=4)
+    return found
 
 
 def workers_of(executor: Any) -> int:
