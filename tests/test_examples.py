@@ -78,7 +78,9 @@ def test_examples_run(example: Any, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert all(path.exists() for path in maps)
     pictures = sorted(set(tmp_path.glob("*.png")) - maps)
     assert len(pictures) + len(maps) == len(set(tmp_path.iterdir()) - maps)
-    assert len(pictures) + len(maps) == printed.count("wrote ") >= (2 if example in demo.NETS else 1)
+    assert (
+        len(pictures) + len(maps) == printed.count("wrote ") >= (2 if example in demo.NETS else 1)
+    )
     assert example in demo.NETS or tmp_path / f"{named(example)}.png" in pictures
     for path in pictures:
         content = path.read_bytes()
