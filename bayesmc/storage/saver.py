@@ -71,11 +71,20 @@ class Saver:
         What the file says of the run.
     alone : bool
         Let no other process save there.
+    of : path, optional
+        The file that the user named, where this one is that of a unit.
     """
 
-    def __init__(self, file: CheckpointFile, header: Mapping[str, Any], alone: bool = True) -> None:
-        self.path, self.every, self.header = Path(file.path), float(file.every), header
-        self.blocks = Blocks(self.path, file.repair, alone)
+    def __init__(
+        self,
+        file: CheckpointFile,
+        header: Mapping[str, Any],
+        alone: bool = True,
+        of: Path | None = None,
+    ) -> None:
+        self.file, self.header = file, header
+        self.path, self.every = Path(file.path), float(file.every)
+        self.blocks = Blocks(self.path, file.repair, alone, of)
         if alone:
             clear_leftovers(self.path)
         last = self.blocks.state
@@ -86,6 +95,10 @@ class Saver:
     def rows(self) -> Iterator[Any]:
         """All rows that were saved, block by block."""
         return map(unpacked, self.blocks.rows())
+
+    def close(self) -> None:
+        """Let other processes save there."""
+        self.blocks.close()
 
     def due(self) -> bool:
         """Whether it is time for the next block."""
