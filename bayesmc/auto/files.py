@@ -72,6 +72,11 @@ def load(
     0.5
     """
     path = Path(path)
+    if path.is_dir():
+        raise FileFormatError(
+            f"{path}: that is a folder; of several series each has a file in it: bmc.load(folder / "
+            '"series0.nc")'
+        )
     image = open_image(path)
     kind = image.attributes.get("kind")
     if kind == RUN:
@@ -93,13 +98,22 @@ class Opened:
         ``"infer"`` or ``"filter"``.
     checkpoint : path or CheckpointFile
     problem : Problem or SeriesProblem
+    named : bool
+        Whether the call names its engine, which then is that of all questions asked with it.
     """
 
-    def __init__(self, call: str, checkpoint: Any, problem: Problem | SeriesProblem) -> None:
-        self.call, self.problem = call, problem
+    def __init__(
+        self, call: str, checkpoint: Any, problem: Problem | SeriesProblem, named: bool = False
+    ) -> None:
+        self.call, self.problem, self.named = call, problem, named
         self.file = CheckpointFile.of(checkpoint)
         self.path = Path(self.file.path)
         libraries()
+        if self.path.is_dir():
+            raise CheckpointError(
+                f"{call}(checkpoint={str(self.path)!r}): that is a folder; give the path of a file, such as "
+                f"{str(self.path / 'run.nc')!r}"
+            )
         self.header: Mapping[str, Any] | None = None
         self.image = None
         if self.path.exists():
@@ -141,7 +155,10 @@ class Opened:
         identity = _identity(self.problem, engine, seed, {"keep": keep, **more})
         header: Mapping[str, Any]
         if self.header is None:
-            header = {"identity": identity, "engine": engine, "seed": seed, "keep": keep}
+            header = {
+                "identity": identity, "engine": engine, "seed": seed, "keep": keep,
+                "named": self.named,
+            }  # fmt: skip
             made(self.path, self.problem, header)
         else:
             header = self.header
@@ -204,6 +221,7 @@ def _identity(
 
 
 def _shown(value: Any) -> str:
+    value = dict(value) if isinstance(value, Mapping) else value  # files know no other mappings
     simple = value is None or isinstance(value, (bool, int, float, str))
     plain = simple or (isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value))
     text = repr(list(value) if isinstance(value, tuple) else value) if plain else ""

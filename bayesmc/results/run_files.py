@@ -8,6 +8,7 @@ removed then.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -27,6 +28,8 @@ from bayesmc.storage.image import Image, Stored
 
 #: what of an identity says which unit of a run a file is of
 _UNIT = "the group"
+#: seconds that a unit waits, again and again, for a file that another process has not let go
+_PATIENCE = (0.1, 0.2, 0.4, 0.8, 1.6)
 
 
 def difference(was: Fingerprint, now: Fingerprint) -> str | None:
@@ -119,17 +122,17 @@ class UnitFile(NamedTuple):
         """
         if not self.path.exists():
             made(self.path, problem, self.header)
-            return RunFile(self.file, self.header, of=self.of), None
+            return self._alone(), None
         image = open_image(self.path)
         was = header_in(image).get("identity", {})
         if why := difference(was, self.header["identity"]):
             raise CheckpointError(
-                f"{self.of}: {self.path.name} beside it, where a group of its chains saves itself, belongs to "
+                f"{self.of}: {self.path.name} beside it, where a group of chains saves itself, belongs to "
                 f"another run: {why}; move it away, or give another path"
             )
         if image.attributes["kind"] == ANSWER:
             return None, answer_in(self.path, image, problem, mapped)
-        return RunFile(self.file, self.header, of=self.of), None
+        return self._alone(), None
 
     def answer(self, problem: Problem) -> Any:
         """That of a unit that has ended, its draws left in the file.
@@ -143,10 +146,19 @@ class UnitFile(NamedTuple):
             image = open_image(self.path)
         except FileNotFoundError:
             raise CheckpointError(
-                f"{self.of}: {self.path.name} beside it, where a worker has saved a group of chains, cannot be "
-                "seen from here; give a path in a folder that workers share"
+                f"{self.of}: {self.path.name} beside it, where a worker has saved a group of chains, cannot "
+                "be seen from here; give a path in a folder that workers share"
             ) from None
         return answer_in(self.path, image, problem, mapped=True)
+
+    def _alone(self) -> RunFile:
+        """The file, which a worker whose loss was noticed a moment ago may not have let go yet."""
+        for seconds in _PATIENCE:
+            try:
+                return RunFile(self.file, self.header, of=self.of)
+            except CheckpointError:
+                time.sleep(seconds)
+        return RunFile(self.file, self.header, of=self.of)
 
 
 def units_so_far(run: RunFile, problem: Problem) -> list[Any]:
