@@ -14,7 +14,7 @@ from bayesmc.errors import BayesmcError, CheckpointError, EvidenceError
 from bayesmc.randomness import child, parent, seed_sequence
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.run_files import header_in
-from bayesmc.storage import CheckpointFile, open_image
+from bayesmc.storage import CheckpointFile, PartFile, open_image
 from bayesmc.workers import completed
 from bayesmc.workers.units import gathered, workers_of
 
@@ -128,7 +128,7 @@ def _series_answered(
     for k, problem in enumerate(unit[1], unit[0]):
         seed, options = child(shared["seed"], k), shared["options"]
         if shared["folder"] is not None:
-            options = {**options, "checkpoint": _file_of(shared["folder"], k)}
+            options = {**options, "checkpoint": _in_folder(shared["folder"], k)}
         try:
             found.append(shared["answer"](problem, shared["engine"], seed, options))
         except BayesmcError as error:
@@ -136,8 +136,8 @@ def _series_answered(
     return found
 
 
-def _file_of(folder: CheckpointFile, k: int) -> CheckpointFile:
-    return replace(folder, path=Path(folder.path) / f"series{k}.nc")
+def _in_folder(folder: CheckpointFile, k: int) -> PartFile:
+    return PartFile.belonging(folder, Path(folder.path) / f"series{k}.nc")
 
 
 def _posed(

@@ -11,7 +11,6 @@ import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,15 @@ from bayesmc.network import Problem
 from bayesmc.network.fingerprint import Fingerprint
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.saving import ANSWER, RUN, RunFile, observed_variables
-from bayesmc.storage import CheckpointFile, Group, open_image, packed, unpacked, write_image
+from bayesmc.storage import (
+    CheckpointFile,
+    Group,
+    PartFile,
+    open_image,
+    packed,
+    unpacked,
+    write_image,
+)
 from bayesmc.storage.blocks import refused
 from bayesmc.storage.image import Image, Stored
 
@@ -90,13 +97,10 @@ class UnitFile(NamedTuple):
     file : CheckpointFile
     header : dict
         What the file says of the unit.
-    of : path
-        The run's own file.
     """
 
-    file: CheckpointFile
+    file: PartFile
     header: Mapping[str, Any]
-    of: Path
 
     @classmethod
     def belonging(cls, run: RunFile, number: int, count: int, engine: Any) -> UnitFile:
@@ -104,7 +108,7 @@ class UnitFile(NamedTuple):
         path = run.path.with_name(f"{run.path.stem}.g{number}{run.path.suffix}")
         identity = {**run.header["identity"], _UNIT: f"={number + 1} of {count}"}
         header = {**run.header, "identity": identity, "engine": engine}
-        return cls(replace(run.file, path=path), header, run.path)
+        return cls(PartFile.belonging(run.file, path), header)
 
     @property
     def path(self) -> Path:
@@ -127,8 +131,8 @@ class UnitFile(NamedTuple):
         was = header_in(image).get("identity", {})
         if why := difference(was, self.header["identity"]):
             raise CheckpointError(
-                f"{self.of}: {self.path.name} beside it, where a group of chains saves itself, belongs to "
-                f"another run: {why}; move it away, or give another path"
+                f"{self.file.given}: {self.path.name} beside it, where a group of chains saves itself, "
+                f"belongs to another run: {why}; move it away, or give another path"
             )
         if image.attributes["kind"] == ANSWER:
             return None, answer_in(self.path, image, problem, mapped)
@@ -146,8 +150,8 @@ class UnitFile(NamedTuple):
             image = open_image(self.path)
         except FileNotFoundError:
             raise CheckpointError(
-                f"{self.of}: {self.path.name} beside it, where a worker has saved a group of chains, cannot "
-                "be seen from here; give a path in a folder that workers share"
+                f"{self.file.given}: {self.path.name} beside it, where a worker has saved a group of "
+                "chains, cannot be seen from here; give a path in a folder that workers share"
             ) from None
         return answer_in(self.path, image, problem, mapped=True)
 
@@ -155,10 +159,10 @@ class UnitFile(NamedTuple):
         """The file, which a worker whose loss was noticed a moment ago may not have let go yet."""
         for seconds in _PATIENCE:
             try:
-                return RunFile(self.file, self.header, of=self.of)
+                return RunFile(self.file, self.header)
             except CheckpointError:
                 time.sleep(seconds)
-        return RunFile(self.file, self.header, of=self.of)
+        return RunFile(self.file, self.header)
 
 
 def units_so_far(run: RunFile, problem: Problem) -> list[Any]:

@@ -57,8 +57,8 @@ class Blocks:
         Take the blocks that are whole of a file that is damaged.
     alone : bool
         Let no other process add blocks, as long as this object lives or until it is closed.
-    of : path, optional
-        What the user calls the file, if it is not its path.
+    named : path, optional
+        What the user gave as ``checkpoint=``, if not this path.
 
     Raises
     ------
@@ -71,10 +71,10 @@ class Blocks:
         path: str | Path,
         repair: bool = False,
         alone: bool = False,
-        of: str | Path | None = None,
+        named: Any = None,
     ) -> None:
         self.path = Path(path)
-        self._called = self.path if of is None else Path(of)
+        self._named = str(path if named is None else named)
         self._lock = Lock(self.path) if alone else None
         self.image = open_image(path)
         self._end = self.image.end
@@ -175,7 +175,7 @@ class Blocks:
         if not count:
             return "None of its blocks is whole; move it away and call again"
         whole = "One of its blocks is whole" if count == 1 else f"{count} of its blocks are whole"
-        again = f"bmc.CheckpointFile({str(self._called)!r}, repair=True)"
+        again = f"bmc.CheckpointFile({self._named!r}, repair=True)"
         return f"{whole}; to go on from the last of them, give checkpoint={again}"
 
     def _tidy(self) -> None:

@@ -61,6 +61,18 @@ class CheckpointFile:
         return given if isinstance(given, cls) else cls(given)
 
 
+@dataclass(frozen=True)
+class PartFile(CheckpointFile):
+    """Where a part of what is asked saves itself; ``given`` is the path for all."""
+
+    given: str | os.PathLike[str] = ""
+
+    @classmethod
+    def belonging(cls, file: CheckpointFile, path: Path) -> PartFile:
+        """One with the options of that for all."""
+        return cls(path, file.every, file.repair, file.path)
+
+
 class Saver:
     """Saves blocks of one run, and hands out what an earlier process saved of it.
 
@@ -71,20 +83,13 @@ class Saver:
         What the file says of the run.
     alone : bool
         Let no other process save there.
-    of : path, optional
-        The file that the user named, where this one is that of a unit.
     """
 
-    def __init__(
-        self,
-        file: CheckpointFile,
-        header: Mapping[str, Any],
-        alone: bool = True,
-        of: Path | None = None,
-    ) -> None:
+    def __init__(self, file: CheckpointFile, header: Mapping[str, Any], alone: bool = True) -> None:
         self.file, self.header = file, header
         self.path, self.every = Path(file.path), float(file.every)
-        self.blocks = Blocks(self.path, file.repair, alone, of)
+        named = file.given if isinstance(file, PartFile) else file.path
+        self.blocks = Blocks(self.path, file.repair, alone, named)
         if alone:
             clear_leftovers(self.path)
         last = self.blocks.state
