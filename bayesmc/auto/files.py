@@ -18,7 +18,8 @@ from bayesmc.dbn import DynamicBayesNet, SeriesProblem
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import CheckpointError, FileFormatError, ModelError, UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph, Problem
-from bayesmc.network.fingerprint import Fingerprint, digest, evidence_fingerprint, fingerprint
+from bayesmc.network.digest import digest
+from bayesmc.network.fingerprint import Fingerprint, evidence_fingerprint, fingerprint
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior, RunFile
 from bayesmc.results.run_files import answer_in, difference, header_in, made, remove_units
