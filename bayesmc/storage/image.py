@@ -2,7 +2,7 @@
 
 NetCDF is HDF5 with names for axes: ``xarray.open_datatree(path)`` and ArviZ read it. Ours has one group
 besides (``bayesmc``), which holds what was saved as packed bytes, and says how far the blocks behind it
-reach.
+reach. Those numbers change as blocks come; everything else in an image has a checksum.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import contextlib
 import glob
 import os
 import tempfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ import numpy as np
 from bayesmc.errors import DamagedFileError, FileFormatError, missing_extra
 
 #: of the layout of files; one that is newer is refused
-VERSION = 1
+VERSION = 2
 #: the group that is ours, what is packed in it, and where blocks end
 GROUP, PACKED, END = "bayesmc", "packed", "end"
 
@@ -116,7 +117,7 @@ def write_image(
                 _write_group(h5py, file.create_group(name), group)
             ours = file.create_group(GROUP)
             size = sum(len(part) for part in packed)
-            ours.dimensions = {"byte": size, "reach": 2}
+            ours.dimensions = {"byte": size, "reach": 3}
             ours.attrs.update({"format": VERSION, **attributes})
             held = ours.create_variable(PACKED, ("byte",), np.uint8)._h5ds
             at = 0
@@ -133,6 +134,7 @@ def write_image(
             size = os.fstat(raw.fileno()).st_size
             set_end(raw.fileno(), where, size)
             set_end(raw.fileno(), where + 8, size)
+            set_end(raw.fileno(), where + 16, _checksum(new, size, where))
 
 
 def open_image(path: str | Path) -> Image:
@@ -143,12 +145,12 @@ def open_image(path: str | Path) -> Image:
     FileNotFoundError
     MissingExtraError
     DamagedFileError
-        It is cut off.
+        It is cut off, or its bytes have changed.
     FileFormatError
         It is no file of ours, or of a version to come.
     """
     h5py, _ = libraries()
-    with _opened(h5py, path) as file:
+    with _opened(h5py, path) as file, _whole(path):
         if GROUP not in file or PACKED not in file[GROUP]:
             raise FileFormatError(
                 f"{path}: a file of this kind, but not one that bayesmc wrote; open it with xarray or ArviZ"
@@ -161,9 +163,11 @@ def open_image(path: str | Path) -> Image:
                 f"{VERSION}); read it with that version"
             )
         held = ours[END]
-        size, end = (int(n) for n in held[...])
-        where = int(held.id.get_offset()) + 8
-        return Image(ours[PACKED][...].tobytes(), attributes, size, end, where)
+        size, end, *checksum = (int(n) for n in held[...])
+        where = int(held.id.get_offset())
+        if checksum and checksum[0] != _checksum(path, size, where):
+            raise _changed(path, f"the first {size} bytes are not those that were written")
+        return Image(ours[PACKED][...].tobytes(), attributes, size, end, where + 8)
 
 
 def is_ours(path: str | Path) -> bool:
@@ -349,6 +353,37 @@ def _opened(h5py: Any, path: str | Path) -> Iterator[Any]:
         raise _unreadable(path, error) from error
     with file:
         yield file
+
+
+@contextmanager
+def _whole(path: str | Path) -> Iterator[None]:
+    """Where bytes have changed HDF5 fails as it happens to."""
+    try:
+        yield
+    except (DamagedFileError, FileFormatError):
+        raise
+    except Exception as error:
+        raise _changed(path, f"what HDF5 reads in it makes no sense ({error})") from error
+
+
+def _changed(path: str | Path, why: str) -> DamagedFileError:
+    return DamagedFileError(
+        f"{path}: {why}; nothing of it can be trusted; move it away and call again", 0
+    )
+
+
+def _checksum(path: str | Path, size: int, where: int) -> int:
+    """Of so many bytes, but for the three numbers that stand there."""
+    found, at = 0, 0
+    with open(path, "rb") as file:
+        while at < size:
+            piece = bytearray(file.read(min(size - at, 1 << 24)))
+            if not piece:
+                break  # it is cut off
+            low, high = max(where - at, 0), max(where + 24 - at, 0)
+            piece[low:high] = bytes(len(piece[low:high]))
+            found, at = zlib.crc32(piece, found), at + len(piece)
+    return found
 
 
 def _open_unlocked(h5py: Any, path: str | Path) -> Any:
