@@ -154,26 +154,33 @@ class Opened:
             The file is of another run; the message says what differs.
         """
         identity = _identity(self.problem, engine, seed, {"keep": keep, **more})
-        header: Mapping[str, Any]
+        header: Mapping[str, Any] = self.header or {
+            "identity": identity, "engine": engine, "seed": seed, "keep": keep, "named": self.named,
+        }  # fmt: skip
         if self.header is None:
-            header = {
-                "identity": identity, "engine": engine, "seed": seed, "keep": keep,
-                "named": self.named,
-            }  # fmt: skip
             made(self.path, self.problem, header)
+            self.image = open_image(self.path)
+            was = header_in(self.image)["identity"]  # another process may have come first
         else:
-            header = self.header
-            if why := difference(header["identity"], identity):
-                raise CheckpointError(
-                    f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; "
-                    "make the same call to go on with it, or give another path"
-                )
-            if self.image is not None and self.image.attributes["kind"] == ANSWER:
-                remove_units(self.path, identity)  # where the process ended before it could
-                spilled = keep == "file" or isinstance(keep, Mapping)
-                with suppress(UnsupportedError):  # of an approximation, which is made again
-                    return Begun(None, answer_in(self.path, self.image, self.problem, spilled))
-        return Begun(RunFile(self.file, header), None)
+            was = header["identity"]
+        if why := difference(was, identity):
+            raise CheckpointError(
+                f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; "
+                "make the same call to go on with it, or give another path"
+            )
+        if self.image is not None and self.image.attributes["kind"] == ANSWER:
+            remove_units(self.path, identity)  # where the process ended before it could
+            spilled = keep == "file" or isinstance(keep, Mapping)
+            with suppress(UnsupportedError):  # of an approximation, which is made again
+                return Begun(None, answer_in(self.path, self.image, self.problem, spilled))
+        run = RunFile(self.file, header)
+        ended = run.blocks.image.attributes["kind"] == ANSWER
+        if ended and (self.image is None or self.image.attributes["kind"] != ANSWER):
+            raise CheckpointError(
+                f"{self.call}(checkpoint={str(self.path)!r}): another process has just ended this run; make "
+                "the same call for its answer"
+            )
+        return Begun(run, None)
 
 
 class Begun(NamedTuple):

@@ -83,7 +83,7 @@ def _of_function(model: Model, name: str, function: Any) -> str:
         kind = type(value).__name__
         warnings.warn(
             f"the function of {name!r} reads a {kind}, whose content cannot be compared: if it changes, "
-            f"the file of a run (checkpoint=, save) will not tell; hold numbers in arrays that the function reads",
+            "the file of a run (checkpoint=, save) will not tell; let the function read arrays and numbers",
             CheckpointWarning,
             stacklevel=2,
         )

@@ -60,7 +60,7 @@ def header_in(image: Image) -> Mapping[str, Any]:
 
 
 def made(path: Path, problem: Any, header: Mapping[str, Any]) -> None:
-    """A new file of a run: what it is about, and no draws.
+    """A new file of a run: what it is about, and no draws; one that another process has just made stays.
 
     Raises
     ------
@@ -76,7 +76,9 @@ def made(path: Path, problem: Any, header: Mapping[str, Any]) -> None:
         held |= {"observed": problem.observed, "inputs": problem.inputs}
         held["model"] = model.without_functions()
     try:
-        write_image(path, groups, packed({"header": held}), {"kind": RUN})
+        write_image(path, groups, packed({"header": held}), {"kind": RUN}, anew=True)
+    except FileExistsError:
+        return
     except OSError as error:
         raise refused(path, error) from error
 
@@ -126,7 +128,6 @@ class UnitFile(NamedTuple):
         """
         if not self.path.exists():
             made(self.path, problem, self.header)
-            return self._alone(), None
         image = open_image(self.path)
         was = header_in(image).get("identity", {})
         if why := difference(was, self.header["identity"]):

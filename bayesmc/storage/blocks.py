@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bayesmc.errors import CheckpointError, DamagedFileError
-from bayesmc.storage.image import open_image, replacing, set_end
+from bayesmc.storage.image import open_image, set_end
+from bayesmc.storage.replacing import replacing
 
 try:
     import fcntl

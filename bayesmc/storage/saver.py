@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesmc.storage.blocks import Blocks
-from bayesmc.storage.image import clear_leftovers
 from bayesmc.storage.packing import packed, unpacked
+from bayesmc.storage.replacing import clear_leftovers
 
 #: time between two blocks, in units of what saving the last one took
 _PATIENCE = 20.0
