@@ -270,7 +270,7 @@ def _checksum(path: str | Path, size: int, where: int) -> int:
         while at < size:
             piece = bytearray(file.read(min(size - at, 1 << 24)))
             if not piece:
-                break  # it is cut off
+                return -1  # it is cut off, or that is not its size
             low, high = max(where - at, 0), max(where + 24 - at, 0)
             piece[low:high] = bytes(len(piece[low:high]))
             found, at = zlib.crc32(piece, found), at + len(piece)
