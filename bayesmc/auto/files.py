@@ -154,6 +154,10 @@ class Opened:
             The file is of another run; the message says what differs.
         """
         identity = _identity(self.problem, engine, seed, {"keep": keep, **more})
+        if self.header is not None and engine is self.header["engine"]:
+            own = f"{type(engine).__name__}("  # options that are the file's own, whatever they came back as
+            was = self.header["identity"]
+            identity |= {what: told for what, told in was.items() if what.startswith(own)}
         header: Mapping[str, Any] = self.header or {
             "identity": identity, "engine": engine, "seed": seed, "keep": keep, "named": self.named,
         }  # fmt: skip

@@ -130,9 +130,12 @@ def _series_answered(
         if shared["folder"] is not None:
             options = {**options, "checkpoint": _in_folder(shared["folder"], k)}
         try:
-            found.append(shared["answer"](problem, shared["engine"], seed, options))
+            answer = shared["answer"](problem, shared["engine"], seed, options)
         except BayesmcError as error:
             raise _in_series(error, k) from None
+        if answer.steps < problem.series.steps:  # Ctrl-C cut it short: left out, as those to come
+            raise KeyboardInterrupt
+        found.append(answer)
     return found
 
 

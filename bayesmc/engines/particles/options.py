@@ -299,5 +299,5 @@ def require_functions(engine: Any, options: Collection[str]) -> None:
     whole = engine.recovery is None or engine.recovery.is_whole
     if not whole or any(value is None for value in given):
         raise UnsupportedError(
-            "ParticleFilter: this engine was unpickled, and pickles carry no functions; make it anew"
+            "ParticleFilter: this engine is a pickle's or a file's, which hold no functions; give it anew"
         )
