@@ -31,6 +31,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
     "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # formulas are set where there is no network, too
     "numpydoc",
     "sphinx_gallery.gen_gallery",
     "sphinx_design",
@@ -50,6 +51,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
 html_title = "bayesmc"
+html_sidebars = {"coming/*": []}  # two columns of code want the whole width
 html_show_sourcelink = False
 html_theme_options = {
     "navbar_align": "left",
@@ -59,6 +61,7 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": ["theme-version"],
 }
+mathjax_path = "mathjax/tex-chtml.js"
 suppress_warnings = ["config.cache", "sphinx_gallery.space_in_filename"]
 
 #: other projects' objects, where a network can be reached
