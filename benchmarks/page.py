@@ -1,8 +1,8 @@
 """The page ``docs/speed.md``, written by the benchmarks: ``python -m benchmarks.page`` (``make speed``).
 
-Each section is what one benchmark prints, with the machine and the day. ``python -m benchmarks.page exact filters``
-measures these sections anew and leaves the others as they stand. Peers stand beside where ``make peers`` has put
-them; a benchmark that fails leaves the page as it was.
+Each section is what one benchmark prints, with the machine and the day.
+``python -m benchmarks.page exact filters`` measures these sections anew and leaves the others as they
+stand. Peers stand beside where ``make peers`` has put them; a benchmark that fails leaves the page as it was.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ from pathlib import Path
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "speed.md"
 HEAD = """# How long things take
 
-Each table below is what a benchmark of the repository printed, on the machine and the day that stand above it; `make speed`
-measures them all anew, `make bench` more of them. Absolute times are those of that machine, and of what else it did: what holds elsewhere are the
-*ratios*, since runs of ours and of others take turns in one process (peers in theirs). A *floor* is code written by hand
+Each table below is what a benchmark of the repository printed, on the machine and the day that
+stand above it; `make speed` measures them all anew, `make bench` more of them. Absolute times are
+those of that machine, and of what else it did: what holds elsewhere are the *ratios*, since runs of
+ours and of others take turns (peers in processes of their own). A *floor* is code written by hand
 for that one model. Chains, and what an effective draw costs beside JAGS and PyMC, are in
-[accuracy](accuracy.md#what-it-costs); why a model of yours is slow, in [mixing](mixing.md#it-mixes-but-a-sweep-is-slow).
+[accuracy](accuracy.md#what-it-costs); why a model of yours is slow, in
+[mixing](mixing.md#it-mixes-but-a-sweep-is-slow).
 """
 
 
@@ -94,7 +96,9 @@ def measure(section: Section) -> str:
         cwd=PAGE.parents[1],
     )
     if done.returncode:
-        raise SystemExit(f"{section.module} failed (exit status {done.returncode}); page not written")
+        raise SystemExit(
+            f"{section.module} failed (exit status {done.returncode}); page not written"
+        )
     shown = f"python -m {' '.join([section.module, *section.arguments])}"
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
     return f"{section.words}\n`{shown}`, {today}, {machine()}:\n\n```\n{done.stdout.strip()}\n```\n"
@@ -107,7 +111,7 @@ def page(measured: Mapping[str, str], old: str = "") -> str:
     >>> "## Importing and declaring" in page({"exact": "2 ms\\n"}, first)
     True
     """
-    kept = {title: text for title, text in re.findall(r"^## (.+?)\n\n(.*?)(?=^## |\Z)", old, re.M | re.S)}
+    kept = dict(re.findall(r"^## (.+?)\n\n(.*?)(?=^## |\Z)", old, re.M | re.S))
     parts = [HEAD]
     for name, section in SECTIONS.items():
         text = measured.get(name, kept.get(section.title))

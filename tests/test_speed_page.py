@@ -16,9 +16,7 @@ def test_other_sections_stay() -> None:
     assert again.index("1 s") < again.index("3 ms")
 
 
-def test_failing_benchmark_writes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failing_benchmark_writes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     written = tmp_path / "docs" / "speed.md"
     written.parent.mkdir()
     written.write_text("as it was", "utf-8")
