@@ -89,6 +89,7 @@ def main(arguments: Sequence[str]) -> None:
 def measure(section: Section) -> str:
     """What the section's benchmark prints, and where and when it did."""
     print(f"{section.title} ...", file=sys.stderr, flush=True)
+    where = machine()
     done = subprocess.run(
         [sys.executable, "-m", section.module, *section.arguments],
         stdout=subprocess.PIPE,
@@ -101,7 +102,7 @@ def measure(section: Section) -> str:
         )
     shown = f"python -m {' '.join([section.module, *section.arguments])}"
     today = datetime.datetime.now(datetime.UTC).date().isoformat()
-    return f"{section.words}\n`{shown}`, {today}, {machine()}:\n\n```\n{done.stdout.strip()}\n```\n"
+    return f"{section.words}\n`{shown}`, {today}, {where}:\n\n```\n{done.stdout.strip()}\n```\n"
 
 
 def page(measured: Mapping[str, str], old: str = "") -> str:
@@ -121,7 +122,7 @@ def page(measured: Mapping[str, str], old: str = "") -> str:
 
 
 def machine() -> str:
-    """Processor, cores and versions, in one line."""
+    """Processor, cores, versions, and what else ran at that moment, in one line."""
     try:
         listed = Path("/proc/cpuinfo").read_text("utf-8")
     except OSError:
@@ -129,7 +130,8 @@ def machine() -> str:
     model = re.search(r"^model name\s*:\s*(.+)$", listed, re.M)
     name = model[1].strip() if model else platform.processor() or platform.machine()
     python = f"Python {platform.python_version()}, NumPy {version('numpy')}"
-    return f"{os.cpu_count()} cores of {name}, {python}"
+    load = f", load {os.getloadavg()[0]:.1f} before it began" if hasattr(os, "getloadavg") else ""
+    return f"{os.cpu_count()} cores of {name}, {python}{load}"
 
 
 if __name__ == "__main__":

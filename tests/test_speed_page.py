@@ -37,4 +37,4 @@ def test_unknown_section_is_named(capsys: pytest.CaptureFixture[str]) -> None:
 def test_measured_section_says_where(monkeypatch: pytest.MonkeyPatch) -> None:
     said = page.measure(page.Section("Version", "Words.", "platform"))
     assert said.startswith("Words.\n`python -m platform`, 2")
-    assert f"{page.machine()}:" in said
+    assert f"{page.machine().partition(', load')[0]}, load " in said
