@@ -60,9 +60,9 @@ format: .venv/.extras-dev
 counts: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.counts
 
-# Warnings are errors. Without a network the links into other projects' pages are left out.
+# Warnings are errors, and so are links that lead nowhere. Without a network the links into other projects' pages are left out.
 SITE = OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -q -W --keep-going -b html docs out/site && \
-	echo "the site is in out/site/index.html"
+	$(PY) docs/links.py out/site && echo "the site is in out/site/index.html"
 
 docs: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,docs
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
