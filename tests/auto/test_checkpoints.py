@@ -105,10 +105,10 @@ def workers() -> Iterator[Any]:
         yield pool
 
 
-@pytest.mark.parametrize("name", ["Gibbs, in groups", "several series"])
-def test_units_of_workers_go_on(name: str, workers: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "saves"), [("Gibbs, in groups", 65), ("several series", 45)])
+def test_units_of_workers_go_on(name: str, saves: int, workers: Any, tmp_path: Path) -> None:
     path, case = tmp_path / "run.nc", CASES[name]
-    with pytest.raises(Stopped), stopped_after(65):  # in the second unit
+    with pytest.raises(Stopped), stopped_after(saves):  # in the second unit
         case.run(path)
     left = {p.name for p in kills.files(path)}
     assert len(left) > 1  # of the run itself, or of another series
