@@ -99,8 +99,8 @@ def cases(size: float = 1.0) -> dict[str, Case]:
         return walk(False, many(1500))
 
     def several() -> tuple[Any, list[dict[str, Any]]]:
-        dbn, seen = walk(False, many(1200))
-        return dbn, [seen, {"y": seen["y"][: many(700)]}]
+        dbn, seen = walk(False, many(700))
+        return dbn, [seen, {"y": seen["y"][: many(400)]}]
 
     filter_ = bmc.ParticleFilter(300, compiled=False)
     particle = bmc.ParticleGibbs(many(60), warmup=many(30), chains=2, particles=20)

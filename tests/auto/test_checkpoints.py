@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +23,7 @@ from bayesmc.errors import (
 )
 from bayesmc.storage import Saver
 from tests import kills
+from tests.workers.test_units import Elsewhere
 
 pytest.importorskip("h5netcdf", reason="needs the extra netcdf")
 
@@ -104,16 +105,56 @@ def workers() -> Iterator[Any]:
         yield pool
 
 
-@pytest.mark.parametrize("name", ["Gibbs, in groups", "several series"])
-def test_units_of_workers_go_on(name: str, workers: Any, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "saves"), [("Gibbs, in groups", 65), ("several series", 45)])
+def test_units_of_workers_go_on(name: str, saves: int, workers: Any, tmp_path: Path) -> None:
     path, case = tmp_path / "run.nc", CASES[name]
-    with pytest.raises(Stopped), stopped_after(65):  # in the second unit
+    with pytest.raises(Stopped), stopped_after(saves):  # in the second unit
         case.run(path)
     left = {p.name for p in kills.files(path)}
     assert len(left) > 1  # of the run itself, or of another series
     case = replace(case, options={"executor": workers})
     assert kills.bits(case.run(path)) == reference(name)
     assert kills.bits(case.run(path)) == reference(name)
+
+
+class Losing(Elsewhere):
+    """Loses the first worker after it has saved so many blocks."""
+
+    def __init__(self, saves: int) -> None:
+        super().__init__()
+        self.saves = saves
+
+    def submit(self, fn: Any, /, *args: Any, **options: Any) -> Future[Any]:
+        if self.sent:
+            return super().submit(fn, *args, **options)
+        self.sent += 1
+        found: Future[Any] = Future()
+        with pytest.raises(Stopped), stopped_after(self.saves):
+            fn(*args, **options)
+        found.set_exception(ConnectionError("the worker is gone"))
+        return found
+
+
+@pytest.mark.parametrize("name", ["Gibbs, in groups", "several series"])
+def test_a_lost_unit_goes_on_from_its_file(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("cloudpickle", reason="units travel by cloudpickle: bayesmc[workers]")
+    counts = []
+    for k, executor in enumerate((Elsewhere(), Losing(25))):
+        (tmp_path / str(k)).mkdir()
+        saved, plain = [], Saver.save
+
+        def save(
+            self: Saver, rows: Any, state: Any, saved: Any = saved, plain: Any = plain
+        ) -> None:
+            saved.append(self.path)
+            plain(self, rows, state)
+
+        case = replace(CASES[name], options={"executor": executor})
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Saver, "save", save)
+            assert kills.bits(case.run(tmp_path / str(k) / "run.nc")) == reference(name)
+        counts.append(len(saved))
+    assert counts[0] > 50 and counts[1] <= counts[0] + 1  # and not 25 blocks more
 
 
 def test_groups_so_far(tmp_path: Path) -> None:
