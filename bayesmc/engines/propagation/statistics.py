@@ -127,7 +127,7 @@ class OwnFamilies:
                 found = self._prior(name)
                 if found is not None:
                     priors[name] = found
-        while not self._all_linear(priors):
+        while priors and not self._all_linear(priors):
             pass
 
     # ---- private -------------------------------------------------------------------------------

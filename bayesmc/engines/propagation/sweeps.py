@@ -86,8 +86,9 @@ def settle(
         return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, pace.share)
     bounds = [b for b in map(bounds_of, batches) if b is not None]
     room = spreads(bounds, beliefs)
+    after = _marginals(beliefs)
     while done < sweeps:
-        before = _marginals(beliefs)
+        before = after
         for batch in batches:
             batch.error = 0.0
         skips = [(batch, _visited(batch, beliefs, pace)) for batch in order]
