@@ -142,8 +142,8 @@ def probit_messages(
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the moments of the normal cdf of ``shift + slope u`` leave when the cavity is divided out again.
 
-    Precisions and linear terms, of proper cavities, from derivatives of the log integral by the cavity's mean,
-    without the moments between. What over- or underflows warns as NumPy is told to.
+    Precisions and linear terms, of proper cavities, from derivatives of the log integral by the cavity's
+    mean, without the moments between. What over- or underflows warns as NumPy is told to.
 
     Parameters
     ----------
