@@ -13,7 +13,7 @@ from scipy import special
 
 import bayesmc as bmc
 from bayesmc.distributions.far_quantiles import beta_lower, gamma_lower, gamma_upper
-from bayesmc.engines.approximate.check import log_joint, pareto_smoothed
+from bayesmc.engines.approximate.weights import log_joint, pareto_smoothed
 from bayesmc.engines.propagation.scores import NormalScores
 from bayesmc.errors import ConvergenceWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.expression.trace import _starred

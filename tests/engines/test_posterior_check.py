@@ -13,8 +13,8 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.engines.approximate.approximation import Drawn
-from bayesmc.engines.approximate.check import pareto_smoothed
 from bayesmc.engines.approximate.posterior import ApproximatePosterior
+from bayesmc.engines.approximate.weights import pareto_smoothed
 from bayesmc.errors import LowEssWarning, UnsupportedError
 from bayesmc.network import pose
 from bayesmc.randomness import seed_sequence
