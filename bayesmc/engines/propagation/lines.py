@@ -71,9 +71,8 @@ class LineBatch(Batch):
         precision, linear = own - self.precision[:, 0, 0], total - self.linear[:, 0]
         precision[np.abs(precision) < ROUNDING * own] = 0.0
         wide = precision[:, None, None], linear[:, None], (mean[:, None], var[:, None, None])
-        return self.kernel.tilted(self.members, *wide).log - log_integral(
-            own[:, None, None], total[:, None]
-        )
+        whole = self.kernel.tilted(self.members, *wide).log
+        return whole - log_integral(own[:, None, None], total[:, None])
 
     # ---- private -------------------------------------------------------------------------------
 
