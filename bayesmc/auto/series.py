@@ -12,6 +12,7 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.several import is_several, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
+from bayesmc.dbn.calendar import last_times
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
@@ -49,11 +50,12 @@ def filter(  # type: ignore[misc]
     Parameters
     ----------
     dbn : DynamicBayesNet
-    observations : dict
+    observations : dict or DataFrame
         Node -> its rows, time first, shape ``(time, *plates, *event)``. Row k belongs to slice k; NaN, a
-        masked entry or None is missing. Static nodes are given without time. A list of such dicts is one of
-        independent series, each with an answer of its own.
-    inputs : dict, optional
+        masked entry or None is missing. Static nodes are given without time. Of a data frame (pandas, polars,
+        pyarrow) columns are nodes and inputs, and its index or a column of dates labels the slices
+        (``.times``). A list of such is one of independent series, each with an answer of its own.
+    inputs : dict or DataFrame, optional
         Input -> its rows, time first; of several series a list of such, or one for all.
     engine : optional
         ``ParticleFilter(particles)``, ...; None chooses (see ``explain``).
@@ -117,7 +119,9 @@ def filter(  # type: ignore[misc]
     if executor is not None and chosen.spreads:
         options["executor"] = executor
     if opened is None:
-        return chosen.filter(problem, seed_sequence(rng), **options)
+        found = chosen.filter(problem, seed_sequence(rng), **options)
+        found.times = problem.times
+        return found
     seed = opened.seed(rng)
     file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
     if file is None:
@@ -196,16 +200,17 @@ def smooth(  # type: ignore[misc]
         )
     problem = pose_series(dbn, observations, inputs)
     found = _smoothed(problem, engine, seed_sequence(rng), options)
+    observations, inputs, found.times = dbn.unframed(observations, inputs)
     found.paths = Paths(problem, observations, inputs)
     return found
 
 
 def forecast(
     dbn: DynamicBayesNet | OnlineBelief,
-    observations: Mapping[str, Any] | None = None,
+    observations: Any = None,
     *,
     steps: int,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -238,18 +243,20 @@ def forecast(
             "forecast: give the observations so far, or a belief in place of the template"
         )
     problem = pose_series(dbn, observations, inputs, ahead=steps)
+    observations, inputs, times = dbn.unframed(observations, inputs)
     chosen = engine_for(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+    found.times = last_times(times, problem.steps, steps)
     found.paths = Paths(problem, observations, inputs)
     return found
 
 
 def most_likely(
     dbn: DynamicBayesNet,
-    observations: Mapping[str, Any],
+    observations: Any,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -283,7 +290,9 @@ def _filtered(
 ) -> SeriesPosterior:
     queries = read_queries("filter", options["queries"])
     chosen = engine_for(problem, engine, Asked("filter", options["keep"], queries))
-    return chosen.filter(problem, seed, **options)
+    found = chosen.filter(problem, seed, **options)
+    found.times = problem.times
+    return found
 
 
 def _smoothed(

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayesmc.dbn.frames import unframed_series
+from bayesmc.dbn.given import is_plain
 from bayesmc.dbn.series import unrolled
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
 from bayesmc.dbn.unroll import sampled, unroll
@@ -304,11 +306,29 @@ class DynamicBayesNet:
         >>> float(bmc.infer(dbn.unroll(4), engine=bmc.Exact()).mean("x[3]"))
         6.0
         """
+        if inputs is not None:
+            inputs = self.unframed(None, inputs)[1]
         return unroll(self.template, steps, inputs)
 
-    def unrolled_evidence(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+    def unrolled_evidence(self, observations: Any) -> dict[str, Any]:
         """Evidence for the unrolled net, ``{"y[0]": row 0, ...}``; missing rows are left out."""
-        return unrolled(self.template, observations)
+        return unrolled(self.template, self.unframed(observations)[0])
+
+    def unframed(self, observations: Any, inputs: Any = None) -> tuple[Any, Any, np.ndarray | None]:
+        """Observations and inputs as dicts where they are data frames, and the times that label their rows.
+
+        A column is about the node or input that it is called like. Rows are slices, in the order of a
+        column of dates (or called like time) or of the index, which go up at equal steps unless an input
+        says how much time passes. With a column called like a plate rows are about its elements, one for
+        each slice and element; else those are columns ``"x[a]"``.
+
+        Raises
+        ------
+        EvidenceError
+        """
+        if is_plain(observations) and is_plain(inputs):
+            return observations, inputs, None
+        return unframed_series(self.template, observations, inputs)
 
     def sample(
         self,

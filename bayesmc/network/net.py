@@ -24,6 +24,7 @@ from bayesmc.network.declaring import (
 )
 from bayesmc.network.evidence import read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
+from bayesmc.network.frames import unframed
 from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model, refuse_objects
@@ -372,6 +373,18 @@ class BayesNet(Declared):
         refuse_objects(model)
         self._store.validate(model)
         return model
+
+    def unframed(self, evidence: Any, inputs: Any = None) -> tuple[Any, Any]:
+        """Evidence and inputs as dicts where they are data frames; others as they are (``network/frames``).
+
+        Raises
+        ------
+        EvidenceError
+        """
+        if all(data is None or isinstance(data, Mapping) for data in (evidence, inputs)):
+            return evidence, inputs
+        plates = self._plates
+        return unframed(self._declarations, plates.sizes, plates.labels, evidence, inputs)
 
     def to_factor_graph(
         self,

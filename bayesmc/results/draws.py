@@ -16,7 +16,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import UnknownNodeError, UnsupportedError
-from bayesmc.network import Problem, forward, read_inputs
+from bayesmc.network import BayesNet, Problem, forward, read_inputs
 from bayesmc.network.evidence import brought_sizes
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
@@ -267,6 +267,8 @@ class DrawsPosterior(AssessedByDraws, Posterior):
                     f"predict({name!r}): {self._node(name).kind} nodes are not drawn"
                 )
         seed = seed_sequence(rng)
+        if isinstance(problem.net, BayesNet):
+            inputs = problem.net.unframed(None, inputs)[1]
         source = self if self.weights is None else self.resample(draws, seed)
         return source._predict(problem, wanted, inputs, plates or {}, stream(seed, Purpose.PREDICT))
 

@@ -54,6 +54,8 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     steps : int
     start : int
         The slice that the first entry belongs to.
+    times : ndarray or None, shape (time,)
+        What labels the slices in the data (dates), where they said.
     log_marginal_likelihood : float or ndarray
         Log density of all rows; one for each element of the plates that are filtered separately.
     log_marginal_increments : ndarray, shape (time,) or (time, *plates)
@@ -95,6 +97,7 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     [[0.182, 0.818], [0.117, 0.883]]
     """
 
+    times: np.ndarray | None = None
     weight_ess: np.ndarray | None = None
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None
