@@ -19,6 +19,7 @@ from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
 from bayesmc.network.fingerprint import fingerprint
 from bayesmc.results.assessed import Assessed
+from bayesmc.results.dataframes import Framed
 from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.marginal_answers import MarginalAnswers
@@ -45,7 +46,7 @@ def quantile_levels(name: str, q: Any) -> np.ndarray:
 
 
 @take_templates
-class Posterior(Assessed, MarginalAnswers):
+class Posterior(Assessed, MarginalAnswers, Framed):
     """Answers about the nodes of a net given evidence.
 
     Attributes

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Model
+from bayesmc.results.dataframes import series_frame
 from bayesmc.results.laws import Laws, NormalLaws, TableLaws, curve_between
 from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.posterior import quantile_levels
@@ -292,6 +293,22 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
         (2, 2)
         """
         save(self, path)
+
+    def to_dataframe(
+        self, names: str | Sequence[str] | None = None, quantiles: Sequence[float] = ()
+    ) -> Any:
+        """Beliefs as a pandas ``DataFrame``: a row for each slice, ``times`` as index where there are some.
+
+        Columns have levels ``node``, ``element`` (labels of plates, places in a vector) and ``statistic``:
+        ``mean``, ``sd`` and quantiles such as ``5%``, or of finite nodes the probability of each state.
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas (the extra ``pandas``).
+        UnknownNodeError, UnsupportedError, QueryError
+        """
+        return series_frame(self, names, quantiles)
 
     def __copy__(self) -> Any:
         """The same answers; unlike a pickle a copy keeps the model's functions."""

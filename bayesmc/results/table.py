@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import MissingExtraError, UnknownNodeError
+from bayesmc.errors import UnknownNodeError, missing_extra
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +66,12 @@ class Summary:
         Raises
         ------
         MissingExtraError
-            Without pandas.
+            Without pandas (the extra ``pandas``).
         """
         try:
             pandas = importlib.import_module("pandas")
         except ImportError:
-            raise MissingExtraError(
-                "to_dataframe: pandas is not installed: pip install pandas"
-            ) from None
+            raise missing_extra("pandas", "pandas") from None
         return pandas.DataFrame(self.columns, index=list(self.names))
 
     def _repr_html_(self) -> str:
