@@ -39,7 +39,7 @@ passes | lowering
 distributions
 expression
 linalg
-resampling | gaussian | diagnostics | markov | plates | states | randomness | progress | storage
+resampling | gaussian | diagnostics | markov | plates | states | randomness | progress | storage | drawing
 categorical
 errors | shapes | objects
 """

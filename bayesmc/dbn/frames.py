@@ -1,7 +1,8 @@
 """Data frames over time: rows as slices, and whether the clock that labels them goes evenly.
 
 Time is one plate more, the first. What labels it is the index, or a column of dates, or one that is called
-like time; without any, row k is slice k.
+like time; without any, row k is slice k. With a column called like a plate rows are about its elements,
+one for each slice and element; else those are columns ``"x[a]"``.
 """
 
 from __future__ import annotations

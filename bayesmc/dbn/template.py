@@ -16,6 +16,7 @@ from bayesmc.dbn.frames import unframed_series
 from bayesmc.dbn.given import is_plain
 from bayesmc.dbn.series import unrolled
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
+from bayesmc.dbn.two_slices import template_html
 from bayesmc.dbn.unroll import sampled, unroll
 from bayesmc.distributions import Distribution
 from bayesmc.errors import (
@@ -315,12 +316,7 @@ class DynamicBayesNet:
         return unrolled(self.template, self.unframed(observations)[0])
 
     def unframed(self, observations: Any, inputs: Any = None) -> tuple[Any, Any, np.ndarray | None]:
-        """Observations and inputs as dicts where they are data frames, and the times that label their rows.
-
-        A column is about the node or input that it is called like. Rows are slices, in the order of a
-        column of dates (or called like time) or of the index, which go up at equal steps unless an input
-        says how much time passes. With a column called like a plate rows are about its elements, one for
-        each slice and element; else those are columns ``"x[a]"``.
+        """Observations and inputs as dicts where they are data frames, and the times of their rows.
 
         Raises
         ------
@@ -375,6 +371,10 @@ class DynamicBayesNet:
 
     def __repr__(self) -> str:
         return f"DynamicBayesNet({self.name!r}, {len(self)} nodes)"
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it: two slices as a graph, and a table of nodes."""
+        return template_html(self)
 
     # ---- private ----------------------------------------------------------------------------
 

@@ -29,6 +29,7 @@ from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model, refuse_objects
 from bayesmc.network.node import Declaration, Node, Potential, decorating, without_noise
+from bayesmc.network.shown import net_html
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
 
@@ -241,6 +242,11 @@ class BayesNet(Declared):
 
     def __repr__(self) -> str:
         return f"BayesNet({self.name!r}, {len(self)} nodes)"
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it: the graph, and a table of nodes."""
+        known, factors = self._declarations, self._potentials
+        return net_html(repr(self), known, self.__getitem__, factors, self.plates)
 
     @property
     def nodes(self) -> tuple[str, ...]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from types import MappingProxyType
 from typing import Any
 
@@ -26,6 +25,7 @@ from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.over_time import expanded, take_templates
 from bayesmc.results.query import Query
 from bayesmc.results.saving import save
+from bayesmc.results.shown import posterior_html
 from bayesmc.results.table import Summary
 
 Plates = str | Sequence[str]
@@ -419,11 +419,8 @@ class Posterior(Assessed, MarginalAnswers, Framed):
         return self
 
     def _repr_html_(self) -> str:
-        """As notebooks show it: the summary, where there is one."""
-        try:
-            return self.summary()._repr_html_()
-        except UnsupportedError as error:
-            return f"<pre>{escape(repr(self))}\n{escape(str(error))}</pre>"
+        """As notebooks show it: the engine, the evidence, and the summary, where there is one."""
+        return posterior_html(self)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import copy
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Model
-from bayesmc.results.dataframes import series_frame
 from bayesmc.results.laws import Laws, NormalLaws, TableLaws, curve_between
 from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.posterior import quantile_levels
 from bayesmc.results.saving import save
 from bayesmc.results.series_checks import SeriesChecks
+from bayesmc.results.shown import ShownSeries
 from bayesmc.results.statistics import table_variance
 
 #: what is asked of answers over time that has another name here, or that only some filters have
@@ -43,7 +43,7 @@ _INSTEAD = {
 }
 
 
-class SeriesPosterior(SeriesChecks, MarginalAnswers):
+class SeriesPosterior(SeriesChecks, MarginalAnswers, ShownSeries):
     """Beliefs about the nodes of every slice.
 
     Attributes
@@ -293,22 +293,6 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
         (2, 2)
         """
         save(self, path)
-
-    def to_dataframe(
-        self, names: str | Sequence[str] | None = None, quantiles: Sequence[float] = ()
-    ) -> Any:
-        """Beliefs as a pandas ``DataFrame``: a row for each slice, ``times`` as index where there are some.
-
-        Columns have levels ``node``, ``element`` (labels of plates, places in a vector) and ``statistic``:
-        ``mean``, ``sd`` and quantiles such as ``5%``, or of finite nodes the probability of each state.
-
-        Raises
-        ------
-        MissingExtraError
-            Without pandas (the extra ``pandas``).
-        UnknownNodeError, UnsupportedError, QueryError
-        """
-        return series_frame(self, names, quantiles)
 
     def __copy__(self) -> Any:
         """The same answers; unlike a pickle a copy keeps the model's functions."""
