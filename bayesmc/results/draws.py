@@ -309,15 +309,15 @@ class DrawsPosterior(AssessedByDraws, Posterior):
             ancestors=self.ancestors,
         )
 
-    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
+    def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
         if self.weights is not None and resample is None:
             raise UnsupportedError(
                 "to_datatree: these draws are weighted and ArviZ would drop the weights; pass "
                 "resample=draws for equally weighted ones"
             )
         if resample is not None:
-            return self.resample(resample, rng).to_datatree()
-        return datatree(self)
+            return self.resample(resample, rng).to_datatree(rng=rng, **groups)
+        return datatree(self, rng=rng, **groups)
 
     # ---- private -----------------------------------------------------------------------------
 

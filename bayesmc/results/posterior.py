@@ -204,10 +204,16 @@ class Posterior(Assessed, MarginalAnswers, Framed):
         """Posterior predictive: ``names`` drawn anew given the posterior draws of everything else."""
         raise self._cannot("predict")
 
-    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
-        """The draws as an ArviZ ``DataTree``, for ``arviz_stats.summary(tree)`` and its like.
+    def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
+        """The draws as an ArviZ ``DataTree`` (extra ``arviz``), with the groups that PyMC writes.
 
-        The extra ``arviz`` installs what these need; for pictures install arviz-plots, too.
+        Always ``posterior``, and where there are some ``sample_stats``, ``observed_data``, ``constant_data``
+        (inputs); dimensions are plates with their labels, ``time`` for slices. ``resample`` draws are made of
+        weighted or exact answers. ``groups`` ask for more:
+
+        ``log_likelihood=True`` has it point by point, for ``arviz_stats.loo``; ``predictive=True`` (or what
+        ``predict`` returned) ``posterior_predictive``; ``prior=`` (of ``prior_predict``) ``prior`` and
+        ``prior_predictive``; ``predictions=`` (of ``predict`` with new inputs) a group of that name.
         """
         raise self._cannot("to_datatree")
 
