@@ -45,9 +45,11 @@ def datatree(
     }
     if data:
         groups["observed_data"] = data
-    diverged = getattr(posterior, "divergences", None)
-    if diverged is not None:
-        groups["sample_stats"] = {"diverging": diverged}
+    told = {"diverging": "divergences", "energy": "energies"}
+    kept = {n: getattr(posterior, own, None) for n, own in told.items()}
+    stats = {n: found for n, found in kept.items() if found is not None}
+    if stats:
+        groups["sample_stats"] = stats
     dims = {}
     for name, own in {**free, **_by_template(model, seen, partly=True)}.items():
         dims[name] = _dims(model, name, own)
@@ -67,8 +69,8 @@ def datatree(
         _attach(tree, _draws_of(prior, "prior", [n for n in prior.names if n not in rows]))
         _attach(tree, _draws_of(prior, "prior_predictive", rows))
     if predictions is not None:
-        kept = [n for n in rows if n in getattr(predictions, "_stored", {})]
-        _attach(tree, _draws_of(predictions, "predictions", kept, "predictions_constant_data"))
+        drawn_anew = [n for n in rows if n in getattr(predictions, "_stored", {})]
+        _attach(tree, _draws_of(predictions, "predictions", drawn_anew, "predictions_constant_data"))
     return tree
 
 
