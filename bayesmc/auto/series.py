@@ -125,10 +125,14 @@ def filter(  # type: ignore[misc]
     seed = opened.seed(rng)
     file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
     if file is None:
+        answer.times = problem.times
         return answer
     if isinstance(chosen, ParticleFilter):
-        return chosen.filter(problem, seed, **options, checkpoint=file)
+        found = chosen.filter(problem, seed, **options, checkpoint=file)
+        found.times = problem.times
+        return found
     found = chosen.filter(problem, seed, **options)
+    found.times = problem.times
     if not getattr(found, "interrupted", False):
         file.finish(found)
     return found

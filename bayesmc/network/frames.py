@@ -172,6 +172,11 @@ def unframed(
     if is_frame(inputs):
         table = read_table("inputs", inputs, declarations, plates, labels)
         inputs = _by_name(table, declarations, labels)
+    for what, data in (("evidence", evidence), ("inputs", inputs)):
+        if data is not None and not isinstance(data, Mapping):
+            raise EvidenceError(
+                f"{what} is a {type(data).__name__}; give a dict from node name to value, or a data frame"
+            )
     return evidence, inputs
 
 

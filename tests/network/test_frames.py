@@ -221,3 +221,14 @@ def test_polars_and_pyarrow() -> None:
     frame = polars.DataFrame(HOUSES).with_columns(polars.col("county").cast(polars.Categorical))
     for given in (frame, frame.to_arrow()):
         np.testing.assert_allclose(bmc.infer(radon(), given).mean("level"), wanted)
+
+
+def test_what_is_no_frame_and_texts_that_are_no_numbers() -> None:
+    net = bmc.BayesNet(plates={"i": None})
+    net.add("y", bmc.Normal(0.0, 1.0), plates="i")
+    with pytest.raises(EvidenceError, match="evidence is a Series; give a dict .* or a data frame"):
+        bmc.infer(net, pd.Series([1.0, 2.0], name="y"))
+    with pytest.raises(EvidenceError, match="'y': .*'1', .* is not a number"):
+        bmc.infer(net, pd.DataFrame({"y": ["1", "2"]}))
+    with pytest.raises(EvidenceError, match="the data have two columns 'y'"):
+        bmc.infer(net, pd.DataFrame([[1.0, 2.0]], columns=["y", "y"]))
