@@ -70,7 +70,9 @@ def datatree(
         _attach(tree, _draws_of(prior, "prior_predictive", rows))
     if predictions is not None:
         drawn_anew = [n for n in rows if n in getattr(predictions, "_stored", {})]
-        _attach(tree, _draws_of(predictions, "predictions", drawn_anew, "predictions_constant_data"))
+        _attach(
+            tree, _draws_of(predictions, "predictions", drawn_anew, "predictions_constant_data")
+        )
     return tree
 
 
