@@ -38,9 +38,11 @@ def datatree(posterior: Posterior) -> Any:
     }
     if data:
         groups["observed_data"] = data
-    diverged = getattr(posterior, "divergences", None)
-    if diverged is not None:
-        groups["sample_stats"] = {"diverging": diverged}
+    told = {"diverging": "divergences", "energy": "energies"}
+    stats = {n: getattr(posterior, own, None) for n, own in told.items()}
+    stats = {n: found for n, found in stats.items() if found is not None}
+    if stats:
+        groups["sample_stats"] = stats
     dims = {}
     for name, rows in {**free, **_by_template(model, seen, partly=True)}.items():
         node = model[rows[0]]
