@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.errors import QueryError, UnsupportedError
-from bayesmc.plotting.look import BLUE, INK, ORANGE, PALETTE, label_of, numbers, one_scalar, single_axes, tidy
+from bayesmc.plotting.look import (
+    BLUE,
+    INK,
+    ORANGE,
+    PALETTE,
+    dates,
+    label_of,
+    numbers,
+    one_scalar,
+    single_axes,
+    tidy,
+)
 from bayesmc.results import Posterior, SeriesPosterior
 from bayesmc.results.over_time import slices_of
 
@@ -73,7 +84,7 @@ def plot_bands(
     >>> rows = [0.4, None, 2.2]
     >>> ax = bmc.filter(dbn, {"y": rows}).plot.bands("x", observed=rows)
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
-    ['x (filter): median, 50 % and 90 %', 'observed']
+    ['filter: median, 50 and 90 %', 'observed']
     """
     _levels(probs)
     series = _Series.of(answer, name, index, "plot_bands")
@@ -83,11 +94,10 @@ def plot_bands(
         _stack(ax, series, at)
         return ax
     words = _bands(ax, series.rows(probs), at, color)
-    said = label if label is not None else f"{series.label}{series.kind}: {words}"
-    ax.lines[-1].set_label(said)
+    ax.lines[-1].set_label(label if label is not None else f"{series.kind}{words}")
     if observed is not None:
         _points(ax, at, observed, "plot_bands")
-    _finish(ax, series.label, times)
+    _finish(ax, series.label, at, times)
     return ax
 
 
@@ -154,8 +164,9 @@ def plot_forecast(
     second = _Series.of(ahead, name, index, "plot_forecast")
     if getattr(ahead, "kind", "") != "forecast" or second.start != first.start + first.steps:
         raise QueryError(
-            f"plot_forecast: the second answer is of slices {second.start} to {second.start + second.steps - 1} "
-            f"({getattr(ahead, 'kind', 'no series')}), and should be the forecast that begins at slice "
+            f"plot_forecast: the second answer is of slices {second.start} to "
+            f"{second.start + second.steps - 1} ({getattr(ahead, 'kind', 'no series')}), and should be the "
+            "forecast that begins at slice "
             f"{first.start + first.steps}: forecast(dbn, rows, steps=) with the rows of the first"
         )
     if first.tables is not None or second.tables is not None:
@@ -169,21 +180,21 @@ def plot_forecast(
     rows = [part[begin:] for part in first.rows(probs)[0]]
     words = first.rows(probs)[1]
     _bands(ax, (rows, words), at[begin : first.steps], BLUE)
-    ax.lines[-1].set_label(f"{first.label}{first.kind}: {words}")
+    ax.lines[-1].set_label(f"{first.kind}{words}")
     fan, words = second.rows(probs)
     joined = [np.concatenate([part[-1:], own]) for part, own in zip(rows, fan, strict=True)]
     _bands(ax, (joined, words), at[first.steps - 1 :], ORANGE)
-    ax.lines[-1].set_label(f"forecast: {words}")
+    ax.lines[-1].set_label("forecast" if words == first.rows(probs)[1] else f"forecast: {words}")
     ax.axvline(at[first.steps - 1], color=INK, linewidth=0.7, linestyle=(0, (3, 3)))
     if observed is not None:
         given = numbers(observed, "plot_forecast")
         if len(given) not in (first.steps, total):
             raise QueryError(
-                f"plot_forecast: observed has {len(given)} rows; there are {first.steps} slices before the forecast "
-                f"and {second.steps} of it"
+                f"plot_forecast: observed has {len(given)} rows; there are {first.steps} slices before "
+                f"the forecast and {second.steps} of it"
             )
         _points(ax, at[begin : len(given)], given[begin:], "plot_forecast")
-    _finish(ax, first.label, times)
+    _finish(ax, first.label, at, times)
     return ax
 
 
@@ -202,7 +213,7 @@ class _Series:
         self.steps, self.tables = steps, tables
         self.start = int(getattr(answer, "start", 0))
         kind = getattr(answer, "kind", "")
-        self.kind = f" ({kind})" if kind else ""
+        self.kind = f"{kind}: " if kind else ""
 
     @classmethod
     def of(cls, answer: Any, name: str, index: Any, what: str) -> _Series:
@@ -212,14 +223,15 @@ class _Series:
             slices = slices_of(answer.model, name)
             if slices is None:
                 raise QueryError(
-                    f"{what}: {name!r} has no slices over time here; give an answer of filter, smooth or forecast, "
-                    "or of infer(template, rows). plot_marginal and plot_forest draw nodes without time"
+                    f"{what}: {name!r} has no slices over time here; give an answer of filter, smooth or "
+                    "forecast, or of infer(template, rows). plot_marginal and plot_forest draw nodes "
+                    "without time"
                 )
             node = answer.model.nodes[slices[0]]
         else:
             raise UnsupportedError(
-                f"{what}: a {type(answer).__name__} is no answer over time; give that of filter, smooth or forecast, "
-                "or of infer(template, rows)"
+                f"{what}: a {type(answer).__name__} is no answer over time; give that of filter, smooth or "
+                "forecast, or of infer(template, rows)"
             )
         scalar = one_scalar(answer, node.name, index, node.value_shape, what)
         label = label_of(answer, node.name, scalar.index).replace(node.name, name, 1)
@@ -240,10 +252,9 @@ class _Series:
         """The middle, then lower and upper ends of each band, narrow ones first; what they are."""
         levels = sorted(probs)
         every = [0.5, *(q for p in levels for q in (0.5 - p / 2, 0.5 + p / 2))]
-        at = (slice(None), slice(None), *self.index)
-        said = " and ".join(f"{100 * p:g} %" for p in levels)
-        if len(levels) > 2:
-            said = ", ".join(f"{100 * p:g}" for p in levels[:-1]) + f" and {100 * levels[-1]:g} %"
+        at: Any = (slice(None), slice(None), *self.index)
+        said = ", ".join(f"{100 * p:g}" for p in levels[:-1])
+        said = f"{said} and {100 * levels[-1]:g} %" if said else f"{100 * levels[-1]:g} %"
         try:
             found = np.asarray(self.answer.quantile(self.name, every), dtype=float)[at]
             return list(found.T), f"median, {said}"
@@ -251,12 +262,12 @@ class _Series:
             from scipy.special import ndtri
 
             middle, spread = (
-                np.asarray(figure(self.name), dtype=float)[(slice(None), *self.index)]
+                np.asarray(figure(self.name), dtype=float)[at[1:]]
                 for figure in (self.answer.mean, self.answer.std)
             )
             widths = [float(ndtri(q)) for q in every]
-            said = ", ".join(f"{ndtri(0.5 + p / 2):.2g}" for p in levels)
-            return [middle + w * spread for w in widths], f"mean, {said} standard deviations"
+            said = ", ".join(f"{ndtri(0.5 + p / 2):.2f}" for p in levels)
+            return [middle + w * spread for w in widths], f"mean ± {said} sd"
 
 
 def _axis(times: Any, start: int, steps: int, what: str) -> np.ndarray:
@@ -272,7 +283,9 @@ def _axis(times: Any, start: int, steps: int, what: str) -> np.ndarray:
 
 def _levels(probs: Sequence[float]) -> None:
     if not len(probs) or not all(0 < p < 1 for p in probs):
-        raise QueryError(f"probs={probs!r}: bands have probabilities between 0 and 1, as (0.5, 0.9)")
+        raise QueryError(
+            f"probs={probs!r}: bands have probabilities between 0 and 1, as (0.5, 0.9)"
+        )
 
 
 def _bands(ax: Axes, found: Rows, at: np.ndarray, color: str) -> str:
@@ -288,41 +301,60 @@ def _points(ax: Axes, at: np.ndarray, observed: Any, what: str) -> None:
     values = numbers(observed, what)
     if values.shape != (len(at),):
         raise QueryError(
-            f"{what}: observed has shape {values.shape}, and there are {len(at)} slices; give one number for each, "
-            "NaN where there is none"
+            f"{what}: observed has shape {values.shape}, and there are {len(at)} slices; give one number for "
+            "each, NaN where there is none"
         )
     size = 4.0 if len(at) <= 100 else 2.5 if len(at) <= 500 else 1.5
-    ax.plot(at, values, "o", color=INK, markersize=size, markeredgewidth=0, alpha=0.7, label="observed")
+    ax.plot(
+        at, values, "o", color=INK, markersize=size, markeredgewidth=0, alpha=0.7, label="observed"
+    )
 
 
 def _stack(ax: Axes, series: _Series, at: np.ndarray) -> None:
     """Probabilities of states on top of each other, a step for each slice."""
     many = series.tables.shape[1]
     if many > len(PALETTE):
-        image = ax.pcolormesh(at, np.arange(many), series.tables.T, cmap="cividis", vmin=0, shading="nearest")
+        image = ax.pcolormesh(
+            at, np.arange(many), series.tables.T, cmap="cividis", vmin=0, shading="nearest"
+        )
         ax.set_yticks(range(many), series.states) if many <= 30 else None
-        ax.get_figure(root=True).colorbar(image, ax=ax, label="probability")
+        figure: Any = ax.get_figure(root=True)
+        figure.colorbar(image, ax=ax, label="probability")
     else:
         below = np.zeros(len(at))
         for k in range(many):
             above = below + series.tables[:, k]
-            ax.fill_between(at, below, above, step="mid", color=PALETTE[k], alpha=0.8, linewidth=0, label=series.states[k])
+            ax.fill_between(
+                at,
+                below,
+                above,
+                step="mid",
+                color=PALETTE[k],
+                alpha=0.8,
+                linewidth=0,
+                label=series.states[k],
+            )
             below = above
         ax.set_ylim(0, 1)
         ax.set_ylabel("probability")
-        ax.legend(frameon=False, fontsize="small", title=series.label, loc="upper left", bbox_to_anchor=(1, 1))
+        ax.legend(frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(1, 1))
     ax.margins(x=0)
-    ax.set_title(f"{series.label}{series.kind}", fontsize="medium", parse_math=False)
-    ax.set_xlabel("slice")
+    ax.set_title(f"{series.kind}{series.label}", fontsize="medium", parse_math=False)
+    dates(ax, at)
+    if at.dtype.kind in "iu":
+        ax.set_xlabel("slice")
 
 
-def _finish(ax: Axes, label: str, times: Any) -> None:
+def _finish(ax: Axes, label: str, at: np.ndarray, times: Any) -> None:
     ax.margins(x=0)
+    dates(ax, at)
     ax.set_ylabel(label, parse_math=False)
     if times is None:
         ax.set_xlabel("slice")
-        ax.xaxis.get_major_locator().set_params(integer=True)
-    legend = ax.legend(frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
+        ax.locator_params(axis="x", integer=True)
+    legend = ax.legend(
+        frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=3
+    )
     for text in legend.get_texts():
         text.set_parse_math(False)
     tidy(ax)

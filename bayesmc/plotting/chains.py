@@ -1,11 +1,12 @@
-"""Pictures of Markov chains: traces, ranks, energies; and of any posterior's numbers: intervals, pairs.
+"""Pictures of Markov chains: traces, ranks, energies.
 
-The figures behind them (kernel densities, effective sizes) are arviz-stats', by its array interface.
+The figures behind them (kernel densities, effective sizes) are arviz-stats', by its array interface. ArviZ's
+own pictures are not called: they take no axes and no weights, and releases of arviz-plots for Python 3.11 do
+not load beside matplotlib 3.11.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,11 +17,9 @@ from bayesmc.plotting.look import (
     FAINT,
     INK,
     ORANGE,
-    PALETTE,
-    VERMILION,
     Names,
-    Scalar,
     chosen_scalars,
+    draw_density,
     grid_axes,
     line_style,
     note,
@@ -29,8 +28,7 @@ from bayesmc.plotting.look import (
     title,
     wrapped,
 )
-from bayesmc.results import ChainsPosterior, DrawsPosterior, Posterior
-from bayesmc.results.laws import interval_probability
+from bayesmc.results import ChainsPosterior, Posterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,13 +38,11 @@ ALARM = 0.05
 _CHAINS = "an engine of Markov chains makes them: Gibbs, MetropolisHastings, HamiltonianMonteCarlo"
 
 
-def plot_trace(
-    posterior: Posterior, names: Names | None = None, *, axes: Any = None
-) -> np.ndarray:
+def plot_trace(posterior: Posterior, names: Names | None = None, *, axes: Any = None) -> np.ndarray:
     """Draw the chains of some numbers: the density of each chain, and its draws in order.
 
-    Chains that have mixed look alike and like noise. Ticks at the bottom are draws whose Hamiltonian trajectory
-    diverged.
+    Chains that have mixed look alike and like noise. Ticks at the bottom are draws whose Hamiltonian
+    trajectory diverged.
 
     Parameters
     ----------
@@ -87,7 +83,7 @@ def plot_trace(
         values = scalar.draws(chains)
         for k, own in enumerate(values):
             style = line_style(k, len(values))
-            _density(left, own, style)
+            draw_density(left, own, style)
             right.plot(own, **{**style, "linewidth": 0.6})
         if diverged is not None and diverged.any():
             low, high = right.get_ylim()
@@ -100,7 +96,9 @@ def plot_trace(
         right.margins(x=0)
         tidy(left, right)
     panels[-1, 0].set_xlabel("value")
-    panels[-1, 1].set_xlabel("draw" if diverged is None or not diverged.any() else "draw (ticks: divergences)")
+    panels[-1, 1].set_xlabel(
+        "draw" if diverged is None or not diverged.any() else "draw (ticks: divergences)"
+    )
     note(panels[0, 0], left_out)
     return panels
 
@@ -176,167 +174,6 @@ def plot_rank(posterior: Posterior, names: Names | None = None, *, axes: Any = N
     return panels[: len(scalars)]
 
 
-def plot_forest(
-    posterior: Posterior | Mapping[str, Posterior],
-    names: Names | None = None,
-    *,
-    prob: float = 0.89,
-    inner: float = 0.5,
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw medians and narrowest intervals of many numbers below each other.
-
-    Parameters
-    ----------
-    posterior : Posterior or dict
-        Whatever made it; or several, name -> posterior, drawn beside each other in colours.
-    names : str or sequence, optional
-        As for ``plot_trace``, 40 numbers at most.
-    prob, inner : float
-        Of the thin line, and of the thick one.
-    ax : matplotlib.axes.Axes, optional
-
-    Returns
-    -------
-    matplotlib.axes.Axes
-
-    Raises
-    ------
-    UnknownNodeError, QueryError, UnsupportedError, MissingExtraError
-
-    Examples
-    --------
-    >>> import matplotlib
-    >>> matplotlib.use("agg")
-    >>> import bayesmc as bmc
-    >>> net = bmc.BayesNet(plates={"school": ["A", "B"]})
-    >>> net.add("effect", bmc.Normal(0.0, 1.0), plates="school")
-    >>> ax = bmc.infer(net).plot.forest()
-    >>> [label.get_text() for label in ax.get_yticklabels()]
-    ['effect[A]', 'effect[B]']
-    """
-    several = posterior if isinstance(posterior, Mapping) else {"": posterior}
-    if not several:
-        raise QueryError("plot_forest: there is no posterior; give one, or {name: posterior}")
-    wide, narrow = (interval_probability("plot_forest", p) for p in (prob, inner))
-    rows: dict[str, list[tuple[int, Posterior, Scalar]]] = {}
-    left_out = ""
-    for k, own in enumerate(several.values()):
-        scalars, left_out = chosen_scalars(own, names, "plot_forest", 40)
-        for scalar in scalars:
-            rows.setdefault(scalar.label, []).append((k, own, scalar))
-    ax = single_axes(ax, (6.0, 0.9 + 0.26 * len(rows) * max(1, 0.7 * len(several))))
-    known: dict[tuple[int, str], tuple[np.ndarray, ...]] = {}
-    for at, members in enumerate(rows.values()):
-        for k, own, scalar in members:
-            if (k, scalar.node) not in known:
-                name = scalar.node
-                known[k, name] = (own.median(name), own.hdi(name, wide), own.hdi(name, narrow))
-            middle, outer, core = (part[scalar.index] for part in known[k, scalar.node])
-            y = at + (0.6 * (k + 0.5) / len(several) - 0.3 if len(several) > 1 else 0.0)
-            color = PALETTE[k % len(PALETTE)]
-            ax.plot(outer, [y, y], color=color, linewidth=1.3, solid_capstyle="butt")
-            ax.plot(core, [y, y], color=color, linewidth=3.6, solid_capstyle="butt")
-            ax.plot(middle, y, "o", color=color, markeredgecolor="white", markersize=5.5)
-    ax.set_yticks(range(len(rows)), list(rows), parse_math=False)
-    ax.set_ylim(len(rows) - 0.4, -0.6)
-    ax.set_xlabel(f"median, {100 * narrow:g} % and {100 * wide:g} % intervals")
-    if len(several) > 1:
-        from matplotlib.lines import Line2D
-
-        lines = [Line2D([], [], color=PALETTE[k % 8], linewidth=3) for k in range(len(several))]
-        ax.legend(lines, list(several), frameon=False, fontsize="small", loc="upper left", bbox_to_anchor=(1, 1))
-    tidy(ax)
-    note(ax, left_out)
-    return ax
-
-
-def plot_pair(
-    posterior: Posterior,
-    names: Names | None = None,
-    *,
-    draws: int = 2000,
-    axes: Any = None,
-) -> np.ndarray:
-    """Draw numbers against each other, with the draws whose Hamiltonian trajectory diverged on top.
-
-    Divergences that gather in a corner say where the chains could not go: into a funnel's neck, mostly.
-
-    Parameters
-    ----------
-    posterior : Posterior
-        Weighted and exact ones are resampled.
-    names : str or sequence, optional
-        As for ``plot_trace``, two to eight numbers; by default the first four.
-    draws : int
-        Drawn at most, evenly taken; divergences are all drawn.
-    axes : array of matplotlib.axes.Axes, optional
-        Numbers by numbers.
-
-    Returns
-    -------
-    ndarray of matplotlib.axes.Axes, shape (numbers, numbers)
-        What lies above the diagonal is switched off.
-
-    Raises
-    ------
-    UnknownNodeError, QueryError, UnsupportedError, ValueError, MissingExtraError
-
-    Examples
-    --------
-    >>> import matplotlib
-    >>> matplotlib.use("agg")
-    >>> import bayesmc as bmc
-    >>> net = bmc.BayesNet()
-    >>> net.add("a", bmc.Normal(0.0, 1.0))
-    >>> net.add("b", lambda a: bmc.Normal(a, 1.0))
-    >>> bmc.infer(net).plot.pair(["a", "b"]).shape
-    (2, 2)
-    """
-    scalars, left_out = chosen_scalars(posterior, names, "plot_pair", 4 if names is None else 8)
-    if len(scalars) < 2:
-        raise QueryError("plot_pair: one number has no pair; name two or more, or draw plot_marginal")
-    drawn = _equal_draws(posterior, draws)
-    columns = [scalar.draws(drawn).ravel() for scalar in scalars]
-    size = len(columns[0])
-    kept = np.arange(0, size, max(1, size // max(draws, 1)))
-    diverged = getattr(posterior, "divergences", None)
-    bad = np.zeros(0, int) if diverged is None else np.flatnonzero(diverged.ravel())
-    many = len(scalars)
-    side = 2.1 if many > 2 else 2.6
-    panels = grid_axes(axes, many, many, (side, side), "plot_pair")
-    for i, j in np.ndindex(many, many):
-        ax = panels[i, j]
-        if j > i:
-            ax.set_axis_off()
-            continue
-        if i == j:
-            _density(ax, columns[i], {"color": BLUE, "linewidth": 1.2})
-            ax.set_yticks([])
-            ax.set_ylim(bottom=0)
-        else:
-            x, y = columns[j], columns[i]
-            ax.plot(x[kept], y[kept], ".", color=BLUE, markersize=2.5, alpha=0.35, markeredgewidth=0, rasterized=True)
-            ax.plot(x[bad], y[bad], "x", color=VERMILION, markersize=4, markeredgewidth=1.0)
-        if i == many - 1:
-            ax.set_xlabel(scalars[j].label, parse_math=False)
-        else:
-            ax.set_xticklabels([])
-        if j == 0 and i > 0:
-            ax.set_ylabel(scalars[i].label, parse_math=False)
-        elif j != i:
-            ax.set_yticklabels([])
-        tidy(ax)
-    if many > 1 and len(bad):
-        from matplotlib.lines import Line2D
-
-        mark = Line2D([], [], color=VERMILION, marker="x", linestyle="none", markersize=5)
-        panels[0, -1].legend([mark], [f"{len(bad)} divergences"], frameon=False, loc="center")
-    _share_ranges(panels, columns)
-    note(panels[0, 0], left_out)
-    return panels
-
-
 def plot_energy(posterior: Posterior, *, ax: Axes | None = None) -> Axes:
     """Draw how energies of Hamiltonian trajectories spread, and how far one is from the next.
 
@@ -381,11 +218,13 @@ def plot_energy(posterior: Posterior, *, ax: Axes | None = None) -> Axes:
         engine = type(getattr(posterior, "engine", None)).__name__
         raise UnsupportedError(
             f"plot_energy: this answer (of {engine}) has no energies, which Hamiltonian trajectories have; "
-            'engine=HamiltonianMonteCarlo(draws) makes those, with draws kept (not keep="summaries"), and Gibbs where '
-            "one block of nodes is moved so (explain says)"
+            'engine=HamiltonianMonteCarlo(draws) makes those, with draws kept (not keep="summaries"), and '
+            "Gibbs where one block of nodes is moved so (explain says)"
         )
     if energies.shape[1] < 4:
-        raise QueryError(f"plot_energy: {energies.shape[1]} draws of each chain are too few; ask for more draws=")
+        raise QueryError(
+            f"plot_energy: {energies.shape[1]} draws of each chain are too few; ask for more draws="
+        )
     ax = single_axes(ax)
     centred = energies - energies.mean(axis=1, keepdims=True)
     steps = np.diff(energies, axis=1)
@@ -395,12 +234,14 @@ def plot_energy(posterior: Posterior, *, ax: Axes | None = None) -> Axes:
         (centred, BLUE, "energies"),
         (steps, ORANGE, "steps from one to the next"),
     ):
-        _density(ax, values.ravel(), {"color": color, "linewidth": 1.4, "label": label}, fill=True)
+        draw_density(
+            ax, values.ravel(), {"color": color, "linewidth": 1.4, "label": label}, fill=True
+        )
     ax.set_ylim(bottom=0)
     ax.set_yticks([])
     ax.set_xlabel("energy, less its mean (nats)")
-    ax.legend(frameon=False, fontsize="small", title=f"lowest E-BFMI of {len(ratio)} chains: {np.nanmin(ratio):.2f}",
-              title_fontsize="small")  # fmt: skip
+    said = f"lowest E-BFMI of {len(ratio)} chains: {np.nanmin(ratio):.2f}"
+    ax.legend(frameon=False, fontsize="small", title=said, title_fontsize="small")
     tidy(ax)
     return ax
 
@@ -416,33 +257,6 @@ def _with_chains(posterior: Any, what: str) -> ChainsPosterior:
         f"{what}: this answer (of {engine}) has no Markov chains with draws; {_CHAINS}, with draws kept (not "
         'keep="summaries"). plot_marginal, plot_forest and plot_pair draw any posterior'
     )
-
-
-def _equal_draws(posterior: Posterior, draws: int) -> DrawsPosterior:
-    """The posterior itself where its draws weigh the same, else draws of it."""
-    if isinstance(posterior, DrawsPosterior) and posterior.weights is None:
-        return posterior
-    found: DrawsPosterior = posterior.resample(draws, rng=0)  # type: ignore[assignment]
-    return found
-
-
-def _density(ax: Axes, values: np.ndarray, style: dict[str, Any], fill: bool = False) -> None:
-    """A kernel density; of whole numbers their shares; a line where nothing varies."""
-    values = values[np.isfinite(values)]
-    if len(values) < 2 or values.min() == values.max():
-        if len(values):
-            ax.axvline(values[0], **style)
-        return
-    if np.array_equal(values, np.round(values)):
-        at, counts = np.unique(values, return_counts=True)
-        ax.plot(at, counts / len(values), drawstyle="steps-mid", **style)
-        return
-    from arviz_stats.base import array_stats
-
-    points, heights, _ = array_stats.kde(values)
-    ax.plot(points, heights, **style)
-    if fill:
-        ax.fill_between(points, heights, color=style["color"], alpha=0.2, linewidth=0)
 
 
 def _ranks(values: np.ndarray) -> np.ndarray:
@@ -464,14 +278,3 @@ def _worth(values: np.ndarray) -> float:
         each = np.array([array_stats.ess(own[None], chain_axis=0, draw_axis=1) for own in values])
     each = each[np.isfinite(each)]
     return float(np.clip(each.mean(), 1.0, draws)) if each.size else float(draws)
-
-
-def _share_ranges(panels: np.ndarray, columns: Sequence[np.ndarray]) -> None:
-    """Rows and columns of panels over the same ranges, without a pixel-wide outlier's say."""
-    for k, values in enumerate(columns):
-        low, high = np.nanmin(values), np.nanmax(values)
-        room = 0.04 * (high - low) or 0.5
-        for ax in panels[k:, k]:
-            ax.set_xlim(low - room, high + room)
-        for ax in panels[k, :k]:
-            ax.set_ylim(low - room, high + room)

@@ -53,9 +53,9 @@ def plot_dag(
     Parameters
     ----------
     net : BayesNet, DynamicBayesNet or Posterior
-        Of a template, a slice and what it reads of the slice before (``x_prev``), each in a frame. Of a posterior
-        its net with marginals in the nodes: bars of states, densities of numbers. Of a node in plates every
-        element has a cell as dark as it is probable, or a curve; of many, some evenly taken.
+        Of a template, a slice and what it reads of the slice before (``x_prev``), each in a frame. Of a
+        posterior its net with marginals in the nodes: bars of states, densities of numbers. Of a node in
+        plates every element has a cell as dark as it is probable, or a curve; of many, some evenly taken.
     observed : collection of str
         Names of observed nodes; the evidence itself will do. A posterior knows its own.
     ax : matplotlib.axes.Axes, optional
@@ -146,8 +146,8 @@ def _read(net: Any, observed: Collection[str]) -> tuple[Any, dict[str, Inset], s
             known = {drawn[name].name for name in [*observed, *seen]}
             return drawn, insets_of(net, seen), known
     raise UnsupportedError(
-        f"plot_dag: a {type(net).__name__} has no graph of nodes to draw; give a BayesNet, a DynamicBayesNet, or a "
-        "posterior of a net"
+        f"plot_dag: a {type(net).__name__} has no graph of nodes to draw; give a BayesNet, a "
+        "DynamicBayesNet, or a posterior of a net"
     )
 
 
@@ -219,7 +219,9 @@ class _Pen:
             top = centre[1] + shape.height / 2
             self.text((centre[0], top - 0.5 * HEIGHT), name)
             width = shape.width - 0.24
-            draw_inset(self.ax, shape.inset, centre[0] - width / 2, top - HEIGHT + 0.04, width, self.scale)
+            draw_inset(
+                self.ax, shape.inset, centre[0] - width / 2, top - HEIGHT + 0.04, width, self.scale
+            )
         elif name:
             self.text(centre, name)
 

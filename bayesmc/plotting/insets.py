@@ -1,6 +1,7 @@
-"""Marginals drawn inside the nodes of a graph: bars of states, densities of numbers, plates element by element.
+"""Marginals inside the nodes of a graph: bars of states, densities of numbers, plates by elements.
 
-Sizes are inches, as those of the graph are. What is drawn is read off a posterior once; nothing here lays out.
+Sizes are inches, as those of the graph are. What is drawn is read off a posterior once; nothing here
+lays out.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from bayesmc.errors import UnsupportedError
 from bayesmc.plotting.look import BLUE
 from bayesmc.results import Posterior
+from bayesmc.states import StateArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,7 +79,12 @@ def insets_of(posterior: Posterior, observed: dict[str, Any]) -> dict[str, Inset
 
 def draw_inset(ax: Axes, inset: Inset, left: float, top: float, width: float, scale: float) -> None:
     """Draw one, ``scale`` being what an inch has become."""
-    style = {"fontsize": SMALL * scale, "parse_math": False, "zorder": 5, "va": "center"}
+    style: dict[str, Any] = {
+        "fontsize": SMALL * scale,
+        "parse_math": False,
+        "zorder": 5,
+        "va": "center",
+    }
     if inset.text:
         ax.text(left + width / 2, top - ROW / 2, inset.text, ha="center", **style)
     elif inset.states:
@@ -93,7 +100,10 @@ def _value(value: Any) -> Inset | None:
     """An observed scalar's value in few characters."""
     if np.ndim(value):
         return None
-    one = value.item() if isinstance(value, (np.ndarray, np.generic)) else value
+    if isinstance(value, StateArray):
+        one: Any = value.labels.item()
+    else:
+        one = value.item() if isinstance(value, (np.ndarray, np.generic)) else value
     text = f"{one:.4g}" if isinstance(one, float) else str(one)
     return Inset(text=f"= {text}" if len(text) <= 14 else f"= {text[:13]}...")
 
@@ -128,6 +138,10 @@ def _curves(posterior: Posterior, name: str) -> Inset | None:
         ends = np.array([m.bounds(OUTSIDE) for m in marginals])
     except UnsupportedError:
         return None
+    vary = ends[:, 0] < ends[:, 1]
+    if vary.any():  # elements that were observed have no curve
+        marginals = [m for m, varies in zip(marginals, vary, strict=True) if varies]
+        ends = ends[vary]
     low, high = float(ends[:, 0].min()), float(ends[:, 1].max())
     if not np.isfinite([low, high]).all():
         return None
@@ -135,7 +149,9 @@ def _curves(posterior: Posterior, name: str) -> Inset | None:
         return _value(low)
     room = 0.05 * (high - low)
     left, right = low - room, high + room
-    if all(m.distribution is None for m in marginals):  # no further than draws: a scale is not below 0
+    if all(
+        m.distribution is None for m in marginals
+    ):  # no further than draws: a scale is not below 0
         left = max(left, min(float(m.values.min()) for m in marginals))
         right = min(right, max(float(m.values.max()) for m in marginals))
     points = np.linspace(left, right, 120)
@@ -151,25 +167,37 @@ def _draw_table(
     from matplotlib.patches import Rectangle
 
     names = 0.075 * max(len(s) for s in inset.states) + 0.06
-    shares = 0.28 if inset.table.shape[1] == 1 else 0.0
+    shares = 0.38 if inset.table.shape[1] == 1 else 0.0
     names = min(names, width - shares - 0.25)
     room = width - names - shares
     for k, (state, row) in enumerate(zip(inset.states, inset.table, strict=True)):
         y = top - ROW * (k + 0.5)
         ax.text(left + names - 0.04, y, state, ha="right", **style)
         tall = 0.78 * ROW
-        frame = {"facecolor": "#ffffff", "edgecolor": "none", "zorder": 4.2}
+        frame: dict[str, Any] = {"facecolor": "#ffffff", "edgecolor": "none", "zorder": 4.2}
         ax.add_patch(Rectangle((left + names, y - tall / 2), room, tall, **frame))
         cells = room / len(row)
         for i, p in enumerate(row):
             if shares:
                 place = {"xy": (left + names, y - tall / 2), "width": room * p, "height": tall}
                 ax.add_patch(Rectangle(**place, facecolor=BLUE, linewidth=0, zorder=4.5))
-                text = f"{100 * p:.0f} %" if 0.005 <= p <= 0.995 or p in (0, 1) else "< 1 %" if p < 0.5 else "> 99 %"
+                text = (
+                    f"{100 * p:.0f} %"
+                    if 0.005 <= p <= 0.995 or p in (0, 1)
+                    else "< 1 %"
+                    if p < 0.5
+                    else "> 99 %"
+                )
                 ax.text(left + width, y, text, ha="right", **style)
             else:
-                place = {"xy": (left + names + i * cells, y - tall / 2), "width": cells, "height": tall}
-                ax.add_patch(Rectangle(**place, facecolor=BLUE, alpha=float(p), linewidth=0, zorder=4.5))
+                place = {
+                    "xy": (left + names + i * cells, y - tall / 2),
+                    "width": cells,
+                    "height": tall,
+                }
+                ax.add_patch(
+                    Rectangle(**place, facecolor=BLUE, alpha=float(p), linewidth=0, zorder=4.5)
+                )
 
 
 def _draw_curves(
@@ -182,7 +210,14 @@ def _draw_curves(
         y = bottom + 0.94 * TALL * heights
         if many == 1:
             ax.fill_between(x, bottom, y, color=BLUE, alpha=0.3, linewidth=0, zorder=4.4)
-        ax.plot(x, y, color=BLUE, linewidth=1.0 if many == 1 else 0.6, alpha=1.0 if many < 4 else 0.6, zorder=4.5)
+        ax.plot(
+            x,
+            y,
+            color=BLUE,
+            linewidth=1.0 if many == 1 else 0.6,
+            alpha=1.0 if many < 4 else 0.6,
+            zorder=4.5,
+        )
     ax.plot([left, left + width], [bottom, bottom], color="#5b6b79", linewidth=0.6, zorder=4.6)
     ax.text(left, bottom - 0.09, inset.ends[0], ha="left", **style)
     ax.text(left + width, bottom - 0.09, inset.ends[1], ha="right", **style)

@@ -1,6 +1,7 @@
 """What pictures share: colours that the colour-blind tell apart, panels, and which numbers are drawn.
 
-Colours are those of Okabe and Ito (2008), Color universal design; where more than eight lines meet they get one.
+Colours are those of Okabe and Ito (2008), Color universal design; where more than eight lines meet they
+get one.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import date
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,7 +42,7 @@ class Scalar:
 
     def draws(self, posterior: Posterior) -> np.ndarray:
         """Its draws, shape ``(chain, draw)``."""
-        values = np.asarray(posterior[self.node])
+        values: Any = posterior[self.node]
         return np.asarray(values[(slice(None), slice(None), *self.index)], dtype=float)
 
 
@@ -145,6 +147,16 @@ def tidy(*axes: Axes) -> None:
         ax.spines[["top", "right"]].set_visible(False)
 
 
+def dates(ax: Axes, at: np.ndarray) -> None:
+    """Short dates along the axis, where it has dates."""
+    if at.dtype.kind == "M" or (len(at) and isinstance(at[0], date)):
+        from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+        locator = AutoDateLocator(minticks=3, maxticks=8)
+        ax.xaxis.set_major_locator(locator)
+        ax.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+
+
 def note(ax: Axes, text: str) -> None:
     """A line in small print below a figure's panels."""
     if text:
@@ -162,6 +174,47 @@ def line_style(k: int, many: int) -> dict[str, Any]:
     if many <= len(PALETTE):
         return {"color": PALETTE[k], "linewidth": 0.9, "alpha": 0.85}
     return {"color": BLUE, "linewidth": 0.5, "alpha": max(0.15, min(0.6, 8 / many))}
+
+
+def numbers(values: Any, what: str) -> np.ndarray:
+    """Values as floats, NaN where missing.
+
+    Raises
+    ------
+    QueryError
+        They are labels.
+    """
+    if isinstance(values, StateArray):
+        raise QueryError(f"{what}: labels cannot be drawn as numbers")
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(float), np.nan)
+    try:
+        return np.array(
+            [np.nan if v is None else v for v in np.asarray(values, dtype=object)], float
+        )
+    except (TypeError, ValueError):
+        raise QueryError(
+            f"{what}: give numbers, one for each slice; labels cannot be drawn"
+        ) from None
+
+
+def draw_density(ax: Axes, values: np.ndarray, style: dict[str, Any], fill: bool = False) -> None:
+    """A kernel density; of whole numbers their shares; a line where nothing varies."""
+    values = values[np.isfinite(values)]
+    if len(values) < 2 or values.min() == values.max():
+        if len(values):
+            ax.axvline(values[0], **style)
+        return
+    if np.array_equal(values, np.round(values)):
+        at, counts = np.unique(values, return_counts=True)
+        ax.plot(at, counts / len(values), drawstyle="steps-mid", **style)
+        return
+    from arviz_stats.base import array_stats
+
+    points, heights, _ = array_stats.kde(values)
+    ax.plot(points, heights, **style)
+    if fill:
+        ax.fill_between(points, heights, color=style["color"], alpha=0.2, linewidth=0)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -195,21 +248,3 @@ def _is_drawn(posterior: Posterior, name: str) -> bool:
     labelled = node.domain is not None and node.domain.labels is not None
     few = math.prod(node.value_shape) <= EACH
     return posterior._is_free(name) and not labelled and not node.is_object and few
-
-
-def numbers(values: Any, what: str) -> np.ndarray:
-    """Values as floats, NaN where missing.
-
-    Raises
-    ------
-    QueryError
-        They are labels.
-    """
-    if isinstance(values, StateArray):
-        raise QueryError(f"{what}: labels cannot be drawn as numbers")
-    if isinstance(values, np.ma.MaskedArray):
-        values = values.astype(float).filled(np.nan)
-    try:
-        return np.array([np.nan if v is None else v for v in np.asarray(values, dtype=object)], float)
-    except (TypeError, ValueError):
-        raise QueryError(f"{what}: give numbers, one for each slice; labels cannot be drawn") from None

@@ -8,7 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.errors import QueryError, UnsupportedError
-from bayesmc.plotting.look import BLUE, FAINT, GREEN, INK, ORANGE, VERMILION, grid_axes, label_of, one_scalar, single_axes, tidy
+from bayesmc.plotting.look import (
+    BLUE,
+    FAINT,
+    GREEN,
+    INK,
+    ORANGE,
+    VERMILION,
+    dates,
+    grid_axes,
+    label_of,
+    one_scalar,
+    single_axes,
+    tidy,
+)
 from bayesmc.results import SeriesPosterior
 
 if TYPE_CHECKING:
@@ -27,8 +40,8 @@ def plot_ancestry(
 ) -> Axes:
     """Draw particles over time with lines to their ancestors; lines that last to the end stand out.
 
-    All particles of the last slice descend from few of early ones: paths that particles carry along say little of
-    slices long past, and ``smooth`` goes back over them.
+    All particles of the last slice descend from few of early ones: paths that particles carry along say
+    little of slices long past, and ``smooth`` goes back over them.
 
     Parameters
     ----------
@@ -40,7 +53,8 @@ def plot_ancestry(
     last : int, optional
         Draw only the last slices.
     shown : int
-        Of the lines that have died out so many per slice at most, evenly taken; those that last are all drawn.
+        Of the lines that have died out so many per slice at most, evenly taken; those that last are all
+        drawn.
     times : sequence, optional
         One for each slice of the series.
     ax : matplotlib.axes.Axes, optional
@@ -74,60 +88,47 @@ def plot_ancestry(
     """
     from matplotlib.collections import LineCollection
 
-    ancestors = _kept(filtered, "ancestors", "plot_ancestry")
+    ancestors: Any = _kept(filtered, "ancestors", "plot_ancestry")
     node = filtered._node(name)
     if node.domain is not None and node.domain.labels is not None:
-        raise UnsupportedError(f"plot_ancestry: {name!r} has labels, which have no height; name a node with numbers")
+        raise UnsupportedError(
+            f"plot_ancestry: {name!r} has labels, which have no height; name a node with numbers"
+        )
     scalar = one_scalar(filtered, name, index, node.value_shape, "plot_ancestry")
-    every = np.asarray(filtered.particles(name), dtype=float)  # type: ignore[attr-defined]
+    every: Any = np.array(filtered.particles(name), dtype=float)  # type: ignore[attr-defined]
     values = every[(slice(None), slice(None), *scalar.index)]
     apart = ancestors.shape[2:]
     rows = ancestors[(slice(None), slice(None), *scalar.index[: len(apart)])]
     steps, size = values.shape
     at = _times(times, steps, filtered.start, "plot_ancestry")
-    if at.dtype.kind not in "biuf":
+    dated = at.dtype.kind not in "biuf"
+    if dated:
         from matplotlib.dates import date2num
 
-        numbers_at, dated = np.asarray(date2num(at)), True
+        where = np.asarray(date2num(at))
     else:
-        numbers_at, dated = at.astype(float), False
+        where = at.astype(float)
     begin = 0 if last is None else max(0, steps - last)
-    alive = np.ones((steps, size), dtype=bool)
-    for t in range(steps - 1, 0, -1):
-        alive[t - 1] = False
-        parents = rows[t][alive[t]]
-        alive[t - 1, parents[parents >= 0]] = True
-    dead, living = [], []
-    for t in range(begin + 1, steps):
-        old = rows[t] >= 0
-        for group, chosen in ((living, alive[t] & old), (dead, ~alive[t] & old)):
-            own = np.flatnonzero(chosen)
-            if group is dead:
-                own = own[:: max(1, -(-len(own) // max(shown, 1)))]
-            parents = rows[t][own]
-            ends = np.stack([values[t - 1, parents], values[t, own]], axis=1)
-            span = np.broadcast_to(numbers_at[t - 1 : t + 1], ends.shape)
-            group.append(np.stack([span, ends], axis=2))
+    alive = _survivors(rows)
     ax = single_axes(ax, (7.2, 3.6))
-    empty = np.zeros((0, 2, 2))
-    for parts, color, width, alpha, label in (
-        (dead, FAINT, 0.5, 0.5, "died out" + ("" if size <= shown else " (some)")),
-        (living, BLUE, 0.9, 0.8, "lasts to the end"),
+    some = "" if size <= shown else " (some)"
+    for lasts, color, width, alpha, label in (
+        (False, FAINT, 0.5, 0.5, f"died out{some}"),
+        (True, BLUE, 0.9, 0.8, "lasts to the end"),
     ):
-        lines = LineCollection(
-            list(np.concatenate([empty, *parts])), colors=color, linewidths=width, alpha=alpha, label=label
-        )
-        ax.add_collection(lines)
-    ax.plot(np.repeat(numbers_at[begin], size), values[begin], ".", color=FAINT, markersize=2)
+        most = size if lasts else shown
+        segments = _segments(values, rows, alive if lasts else ~alive, where, begin, most)
+        style: Any = {"colors": color, "linewidths": width, "alpha": alpha, "label": label}
+        ax.add_collection(LineCollection(list(segments), **style))
+    ax.plot(np.repeat(where[begin], size), values[begin], ".", color=FAINT, markersize=2)
     ax.autoscale_view()
     if dated:
         ax.xaxis_date()
+        dates(ax, at)
     ax.margins(x=0.01)
     roots = int(alive[begin].sum())
-    ax.set_title(
-        f"{int(alive[-1].sum())} particles, {roots} ancestor{'s' if roots != 1 else ''} in slice {filtered.start + begin}",
-        fontsize="medium", loc="left",
-    )  # fmt: skip
+    said = f"{size} particles, {roots} ancestor{'s' if roots != 1 else ''}"
+    ax.set_title(f"{said} in slice {filtered.start + begin}", fontsize="medium", loc="left")
     ax.legend(frameon=False, fontsize="small", loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
     ax.set_ylabel(label_of(filtered, name, scalar.index), parse_math=False)
     if times is None:
@@ -143,7 +144,7 @@ def plot_weights(
     times: Sequence[Any] | np.ndarray | None = None,
     axes: Any = None,
 ) -> np.ndarray:
-    """Draw what particles are worth over time: their effective number, where they were resampled, their weights.
+    """Draw what particles are worth over time: effective number, resampling, and their weights.
 
     Parameters
     ----------
@@ -187,13 +188,16 @@ def plot_weights(
         )
     scalar = one_scalar(filtered, "weight_ess", index, ess.shape[1:], "plot_weights")
     at = _times(times, len(ess), filtered.start, "plot_weights")
-    pick = (slice(None), *scalar.index)
+    pick: Any = (slice(None), *scalar.index)
     held = _held_weights(filtered)
-    panels = grid_axes(axes, 1 if held is None else 2, 1, (7.2, 2.1), "plot_weights", sharex=True).ravel()
+    panels = grid_axes(
+        axes, 1 if held is None else 2, 1, (7.2, 2.1), "plot_weights", sharex=True
+    ).ravel()
     _effective(panels[0], filtered, ess[pick], pick, at)
     if held is not None:
         _spread(panels[1], [one[pick] if one.ndim > 1 else one for one in held], at)
     panels[-1].set_xlabel("slice" if times is None else "")
+    dates(panels[-1], at)
     for ax in panels:
         ax.margins(x=0.01)
         tidy(ax)
@@ -212,12 +216,42 @@ def _kept(filtered: Any, what: str, picture: str) -> np.ndarray:
         )
     if filtered.kind != "filter":
         raise UnsupportedError(
-            f"{picture}: the particles of a {filtered.kind} result have no ancestors; ask the result of filter"
+            f"{picture}: the particles of a {filtered.kind} result have no ancestors; ask the result of "
+            "filter"
         )
     try:
         return np.asarray(getattr(filtered, what))
     except UnsupportedError as error:
         raise UnsupportedError(f"{picture}: {error}") from None
+
+
+def _survivors(rows: np.ndarray) -> np.ndarray:
+    """Which particles have descendants in the last slice, shape (time, particles)."""
+    alive = np.ones(rows.shape, dtype=bool)
+    for t in range(len(rows) - 1, 0, -1):
+        parents = rows[t][alive[t]]
+        alive[t - 1] = False
+        alive[t - 1, parents[parents >= 0]] = True
+    return alive
+
+
+def _segments(
+    values: np.ndarray,
+    rows: np.ndarray,
+    chosen: np.ndarray,
+    where: np.ndarray,
+    begin: int,
+    most: int,
+) -> np.ndarray:
+    """Lines from chosen particles to their ancestors, ``(lines, 2, 2)``; so many of each slice at most."""
+    found = [np.zeros((0, 2, 2))]
+    for t in range(begin + 1, len(values)):
+        own = np.flatnonzero(chosen[t] & (rows[t] >= 0))
+        own = own[:: max(1, -(-len(own) // max(most, 1)))]
+        ends = np.stack([values[t - 1, rows[t][own]], values[t, own]], axis=1)
+        span = np.broadcast_to(where[t - 1 : t + 1], ends.shape)
+        found.append(np.stack([span, ends], axis=2))
+    return np.concatenate(found)
 
 
 def _held_weights(filtered: Any) -> list[np.ndarray] | None:
@@ -226,7 +260,9 @@ def _held_weights(filtered: Any) -> list[np.ndarray] | None:
     return None if clouds is None else [np.asarray(cloud.weights / cloud.total) for cloud in clouds]
 
 
-def _effective(ax: Axes, filtered: Any, ess: np.ndarray, pick: tuple[Any, ...], at: np.ndarray) -> None:
+def _effective(
+    ax: Axes, filtered: Any, ess: np.ndarray, pick: tuple[Any, ...], at: np.ndarray
+) -> None:
     counts = filtered.counts if getattr(filtered, "counts", None) is not None else None
     ax.plot(at, ess, color=BLUE, linewidth=1.3, label="effective")
     if counts is not None:
@@ -251,7 +287,15 @@ def _spread(ax: Axes, held: list[np.ndarray], at: np.ndarray) -> None:
     for weights in held:
         order = np.sort(weights)[::-1] * len(weights)
         mass = np.cumsum(order) / len(weights)
-        levels.append([order[0], *(order[np.searchsorted(mass, p)] if mass[-1] > p else order[-1] for p in (0.1, 0.5, 0.9))])
+        levels.append(
+            [
+                order[0],
+                *(
+                    order[np.searchsorted(mass, p)] if mass[-1] > p else order[-1]
+                    for p in (0.1, 0.5, 0.9)
+                ),
+            ]
+        )
     top, high, middle, low = np.maximum(np.array(levels), 1e-6).T
     ax.fill_between(at, low, high, color=BLUE, alpha=0.25, linewidth=0, label="80 % of the mass")
     ax.plot(at, middle, color=BLUE, linewidth=1.2, label="half of the mass above")
@@ -267,5 +311,7 @@ def _times(times: Any, steps: int, start: int, what: str) -> np.ndarray:
         return np.arange(start, start + steps)
     found = np.asarray(times)
     if found.shape != (steps,):
-        raise QueryError(f"{what}: times has shape {found.shape}, and there are {steps} slices; give one for each")
+        raise QueryError(
+            f"{what}: times has shape {found.shape}, and there are {steps} slices; give one for each"
+        )
     return found

@@ -31,9 +31,9 @@ def plot_predictive(
 ) -> Axes:
     """Draw how an observed node's values spread, over those of data sets that the posterior predicts.
 
-    Numbers are drawn as densities, one thin line for each predicted data set; counts and states as the share of
-    each value, with the range of 90 % of the predicted shares. A single observed number is a line among what was
-    predicted for it.
+    Numbers are drawn as densities, one thin line for each predicted data set; counts and states as the share
+    of each value, with the range of 90 % of the predicted shares. A single observed number is a line among
+    what was predicted for it.
 
     Parameters
     ----------
@@ -64,7 +64,8 @@ def plot_predictive(
 
     References
     ----------
-    Gabry, Simpson, Vehtari, Betancourt and Gelman (2019), Visualization in Bayesian workflow, JRSS A 182, sec. 4.
+    Gabry, Simpson, Vehtari, Betancourt and Gelman (2019), Visualization in Bayesian workflow, JRSS A 182,
+    sec. 4.
 
     Examples
     --------
@@ -85,14 +86,18 @@ def plot_predictive(
             "residual_check(name) and innovations(name), or ask infer(template, rows) by an engine of chains"
         )
     if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 1:
-        raise QueryError(f"plot_predictive(draws={draws!r}): a whole number of data sets, 1 or more")
+        raise QueryError(
+            f"plot_predictive(draws={draws!r}): a whole number of data sets, 1 or more"
+        )
     node, data, predicted = _both(posterior, name, component, int(draws), rng)
     ax = single_axes(ax)
     if isinstance(data, StateArray) or data.dtype.kind in "biu" and len(np.unique(data)) <= FEW:
         _draw_shares(ax, node, data, predicted)
     elif data.size == 1:
         pooled = np.asarray(predicted, dtype=float).ravel()
-        _draw_density(ax, pooled, _points(pooled), {"color": BLUE, "linewidth": 1.4, "label": "predicted"})
+        _draw_density(
+            ax, pooled, _points(pooled), {"color": BLUE, "linewidth": 1.4, "label": "predicted"}
+        )
         ax.axvline(float(data.ravel()[0]), color=INK, linewidth=1.8, label="observed")
     else:
         _draw_densities(ax, np.asarray(data, dtype=float), np.asarray(predicted, dtype=float))
@@ -123,7 +128,9 @@ def _both(
         if own is None:
             continue
         values, new = model[row].decode(own.value), drawn[row]
-        codes = (np.asarray(v.codes if isinstance(v, StateArray) else v) for v in (values, new))
+        codes: Any = (
+            np.asarray(v.codes if isinstance(v, StateArray) else v) for v in (values, new)
+        )
         old, anew = (c[(..., *at)] if at else c for c in codes)
         mask = np.ones(old.shape, bool) if own.mask is None else _of_entries(own.mask, old.shape)
         seen.append(old[mask])
@@ -143,7 +150,7 @@ def _both(
 
 def _of_entries(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """Which entries were seen; of a vector all components or none."""
-    found = np.asarray(mask)
+    found: Any = np.asarray(mask)
     if found.ndim > len(shape):
         found = found.all(axis=tuple(range(len(shape), found.ndim)))
     return np.broadcast_to(found.reshape(found.shape + (1,) * (len(shape) - found.ndim)), shape)
@@ -177,7 +184,9 @@ def _draw_densities(ax: Axes, data: np.ndarray, predicted: np.ndarray) -> None:
     points = _points(both, data)
     for k, own in enumerate(predicted):
         style = {"color": BLUE, "linewidth": 0.6, "alpha": 0.35}
-        _draw_density(ax, own, points, {**style, "label": f"{len(predicted)} predicted" if not k else None})
+        _draw_density(
+            ax, own, points, {**style, "label": f"{len(predicted)} predicted" if not k else None}
+        )
     _draw_density(ax, data, points, {"color": INK, "linewidth": 1.8, "label": "observed"})
     ax.set_yticks([])
     ax.set_xlim(points[0], points[-1])
@@ -194,7 +203,9 @@ def _points(values: np.ndarray, also: np.ndarray | None = None) -> np.ndarray:
 
 def _draw_density(ax: Axes, values: np.ndarray, points: np.ndarray, style: dict[str, Any]) -> None:
     """A kernel density, of the same width rule for all: Scott's, with a robust spread."""
-    spread = min(values.std(), (np.quantile(values, 0.75) - np.quantile(values, 0.25)) / 1.349 or np.inf)
+    spread = min(
+        values.std(), (np.quantile(values, 0.75) - np.quantile(values, 0.25)) / 1.349 or np.inf
+    )
     width = (spread or 0.01 * (points[-1] - points[0])) * len(values) ** -0.2
     kept = values[:: max(1, len(values) // 5000)]
     z = (points[:, None] - kept) / width

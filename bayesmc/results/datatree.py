@@ -39,8 +39,8 @@ def datatree(posterior: Posterior) -> Any:
     if data:
         groups["observed_data"] = data
     told = {"diverging": "divergences", "energy": "energies"}
-    stats = {n: getattr(posterior, own, None) for n, own in told.items()}
-    stats = {n: found for n, found in stats.items() if found is not None}
+    kept = {n: getattr(posterior, own, None) for n, own in told.items()}
+    stats = {n: found for n, found in kept.items() if found is not None}
     if stats:
         groups["sample_stats"] = stats
     dims = {}

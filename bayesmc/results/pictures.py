@@ -21,7 +21,7 @@ class Pictures:
     >>> net = bmc.BayesNet()
     >>> net.add("x", bmc.Normal(0.0, 1.0))
     >>> bmc.infer(net).plot
-    <pictures of ExactPosterior: ancestry, bands, dag, energy, forecast, forest, marginal, pair, predictive, rank, trace, weights>
+    <pictures of ExactPosterior: ancestry, bands, dag, energy, ... trace, weights>
     """
 
     #: hands out all of them, by name
@@ -36,7 +36,9 @@ class Pictures:
         every = type(self).known()
         if name not in every:
             raise AttributeError(
-                f"there is no picture {name!r}; there are {', '.join(sorted(every))}", name=name, obj=self
+                f"there is no picture {name!r}; there are {', '.join(sorted(every))}",
+                name=name,
+                obj=self,
             )
         return partial(every[name], self._answer)
 

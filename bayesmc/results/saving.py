@@ -123,8 +123,8 @@ def groups_of(
         axes = {"chain": range(chains)} | ({"draw": range(draws)} if lazily is None else {})
         groups[name] = Group(variables, {**axes, **coordinates})
         told = {"diverging": "divergences", "energy": "energies"}
-        stats = {n: getattr(answer, own, None) for n, own in told.items()}
-        stats = {n: Variable(("chain", "draw"), v) for n, v in stats.items() if v is not None}
+        rows = {n: getattr(answer, own, None) for n, own in told.items()}
+        stats = {n: Variable(("chain", "draw"), v) for n, v in rows.items() if v is not None}
         if stats:
             groups["sample_stats"] = Group(stats, axes)
     else:
