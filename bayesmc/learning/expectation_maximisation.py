@@ -57,13 +57,13 @@ def maximised(
 
     Notes
     -----
-    After two plain steps it goes further the way these went, by what their difference tells, and stays there if
-    the objective has not fallen (squared extrapolation).
+    After two plain steps it goes further the way these went, by what their difference tells, and stays
+    there if the objective has not fallen (squared extrapolation).
 
     References
     ----------
-    Varadhan and Roland (2008), Simple and globally convergent methods for accelerating the convergence of any EM
-    algorithm, Scandinavian Journal of Statistics 35, eq. 12.
+    Varadhan and Roland (2008), Simple and globally convergent methods for accelerating the convergence of any
+    EM algorithm, Scandinavian Journal of Statistics 35, eq. 12.
     """
     tables = {n: np.array(t) for n, t in start.items()}
     log_likelihood, found = expected(tables)
@@ -96,7 +96,7 @@ def maximised(
 def _extrapolated(
     before: Tables, now: Tables, ahead: Tables, most: float
 ) -> tuple[Tables | None, float]:
-    """Tables on the way of two steps, further on, and how many steps far; None where it would be no further."""
+    """Tables further the way of two steps, and how many steps far; None where that is no further."""
     first = {n: now[n] - before[n] for n in now}
     bend = {n: ahead[n] - now[n] - first[n] for n in now}
     moved, bent = (
