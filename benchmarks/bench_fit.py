@@ -1,7 +1,7 @@
 """Learning beside statsmodels, hmmlearn and pyAgrum: optima, standard errors, EM of tables with missing data.
 
-``python -m benchmarks.bench_fit [CASES]``: CASES (1,000) are those of ALARM that the peer learns from; ours learns from
-10,000 as well. The peers' environment is that of ``make peers``.
+``python -m benchmarks.bench_fit [CASES]``: CASES (1,000) are those of ALARM that the peer learns from; ours
+learns from 10,000 as well. The peers' environment is that of ``make peers``.
 """
 
 from __future__ import annotations

@@ -124,8 +124,8 @@ def test_energies_are_those_of_trajectories() -> None:
     posterior = bmc.infer(net, {"y": np.zeros(3)}, engine=engine, rng=0)
     energies = posterior.energies
     assert energies.shape == (2, 600)
-    # halves of three squared normals from the density, and of three from momenta: Gamma(3, 1) up to a constant,
-    # whose variance 3 is met within 1 in all but one run of 10^4 with 500 independent energies
+    # halves of three squared normals from the density, and of three from momenta: Gamma(3, 1) up to a
+    # constant, whose variance 3 is met within 1 in all but 1 of 1,000 runs with 500 independent energies
     assert abs(energies.var() - 3.0) < 1.0
     ratio = np.square(np.diff(energies)).mean(axis=1) / energies.var(axis=1)
     legend = posterior.plot.energy().get_legend()

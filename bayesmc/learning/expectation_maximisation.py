@@ -68,10 +68,11 @@ def maximised(
     tables = {n: np.array(t) for n, t in start.items()}
     log_likelihood, found = expected(tables)
     history = [log_likelihood + _log_prior(tables, counts)]
-    converged, before, reach = False, None, 4.0
+    converged, reach = False, 4.0
+    before: Tables | None = None
     while not converged and len(history) <= most:
         ahead = {n: _normalised(found[n] + counts[n], tables[n]) for n in tables}
-        far, length = (None, 0.0) if before is None else _extrapolated(before, tables, ahead, reach)
+        far, length = _extrapolated(before, tables, ahead, reach)
         told = None if far is None else _told(expected, far)
         if far is not None and told is not None:
             objective = told[0] + _log_prior(far, counts)
@@ -94,9 +95,11 @@ def maximised(
 
 
 def _extrapolated(
-    before: Tables, now: Tables, ahead: Tables, most: float
+    before: Tables | None, now: Tables, ahead: Tables, most: float
 ) -> tuple[Tables | None, float]:
     """Tables further the way of two steps, and how many steps far; None where that is no further."""
+    if before is None:
+        return None, 0.0
     first = {n: now[n] - before[n] for n in now}
     bend = {n: ahead[n] - now[n] - first[n] for n in now}
     moved, bent = (

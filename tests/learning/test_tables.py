@@ -17,6 +17,7 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.learning.cases import Cases
+from bayesmc.learning.expectation_maximisation import maximised
 
 
 def sprinkler() -> bmc.BayesNet:
@@ -205,7 +206,7 @@ def test_extrapolated_steps_end_where_plain_ones_do() -> None:
     }
     counts = {n: np.full(t.shape, 0.5) for n, t in start.items()}
     plain = {n: t.copy() for n, t in start.items()}
-    for _ in range(4000):
+    for _ in range(1500):
         _, found = cases.expected(plain)
         plain = {n: found[n] + counts[n] for n in plain}
         plain = {n: t / t.sum(axis=-1, keepdims=True) for n, t in plain.items()}
