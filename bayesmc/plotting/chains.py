@@ -207,8 +207,9 @@ def plot_energy(posterior: Posterior, *, ax: Axes | None = None) -> Axes:
     >>> matplotlib.use("agg")
     >>> import bayesmc as bmc
     >>> net = bmc.BayesNet()
-    >>> net.add("x", bmc.Gamma(2.0, 1.0))
-    >>> posterior = bmc.infer(net, engine=bmc.HamiltonianMonteCarlo(500), rng=0)
+    >>> net.add("x", bmc.Normal(0.0, 1.0))
+    >>> net.add("y", lambda x: bmc.Normal(x, 1.0))
+    >>> posterior = bmc.infer(net, {"y": 0.4}, engine=bmc.HamiltonianMonteCarlo(500), rng=0)
     >>> ax = posterior.plot.energy()
     >>> ax.get_xlabel()
     'energy, less its mean (nats)'

@@ -78,7 +78,7 @@ def plot_predictive(
     >>> posterior = bmc.infer(net, {"count": [3, 0, 2, 2, 4]}, engine=bmc.Gibbs(200), rng=0)
     >>> ax = posterior.plot.predictive("count")
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
-    ['observed', 'predicted, median', '90 % of predictions']
+    ['predicted, median', '90 % of predictions', 'observed']
     """
     if not isinstance(posterior, Posterior):
         raise UnsupportedError(
