@@ -18,7 +18,8 @@ import bayesmc as bmc
 from bayesmc.robotics import PoseNormal, bearing_to, compose, range_and_bearing, range_to
 from benchmarks.harness import table
 
-PARTICLES, STEPS, IN_SIGHT, GOAL, SEEDS = 100, 100, 20, 1.5, 6
+PARTICLES, STEPS, IN_SIGHT, GOAL = 100, 100, 20, 1.5
+SEEDS, LENGTHS = 5, (100, 400)  # of drives on which spreads are judged
 
 
 def net(marks: int, mean: Any = (0.0, 0.0), scale: float = 100.0) -> bmc.DynamicBayesNet:
@@ -104,7 +105,7 @@ def main() -> None:
 
 
 def spreads() -> None:
-    """Squared errors of maps over the variances that filters tell, on drives of the model: 1 is calibrated."""
+    """Squared errors of maps over variances that filters tell, on drives of the model: 1 is calibrated."""
     engines = {
         "EKF-SLAM": bmc.ExtendedKalmanFilter(),
         "FastSLAM, 100": bmc.ParticleFilter(100, marginalize="mark"),
@@ -112,7 +113,7 @@ def spreads() -> None:
         "FastSLAM 2.0, 100": bmc.ParticleFilter(100, marginalize="mark", proposal="optimal"),
     }
     lines: list[list[object]] = []
-    for steps in (100, 400):
+    for steps in LENGTHS:
         each: dict[str, list[float]] = {name: [] for name in engines}
         for seed in range(SEEDS):
             motion, labels, rows, places = drive(IN_SIGHT, steps, seed)
@@ -120,7 +121,11 @@ def spreads() -> None:
             inputs = {"motion": motion, "which": labels}
             for name, engine in engines.items():
                 found = bmc.filter(
-                    net(IN_SIGHT, guess, 0.5), {"seen": rows}, inputs=inputs, engine=engine, rng=seed
+                    net(IN_SIGHT, guess, 0.5),
+                    {"seen": rows},
+                    inputs=inputs,
+                    engine=engine,
+                    rng=seed,
                 )
                 off = np.square(found.mean("mark")[-1] - places) / found.var("mark")[-1]
                 each[name].append(float(off.mean()))

@@ -20,7 +20,6 @@ and Fox (2005), Probabilistic Robotics, chapter 13.
 from __future__ import annotations
 
 import tempfile
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -434,7 +433,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         marks, var = (a[-1][met] for a in (belief.mean("mark"), belief.var("mark")))
         path, after = readings.rmse(belief.mean("pose")), map_rmse(marks, drive.marks[met])
         off = np.sqrt((np.square(marks - drive.marks[met]) / var).mean())
-        print(f"  {engine_name:10} path {path:.2f} m, map {after:.2f} m, before it is turned", end=" ")
+        print(
+            f"  {engine_name:10} path {path:.2f} m, map {after:.2f} m, before it is turned", end=" "
+        )
         print(f"{off:.0f} times what its spread tells")
     right = share_right(numbers, short, len(drive.marks))
     near = share_near(numbers, short, drive.marks)

@@ -31,7 +31,9 @@ def test_who_knows_all_is_right_where_landmarks_are_apart() -> None:
     marks = np.array([[2.0, 0.0], [0.0, 3.0], [2.0, 0.1]])
     place = [[2.0, 0.0], [3.0, np.pi / 2], [2.0, 0.0]]
     found = slam_landmarks.ceilings(made([0, 1, 2], [0.0, 0.0, 1.0], place), marks)
-    assert found["told all: nearest"] == pytest.approx(2 / 3)  # the third is read as if it were the first
+    assert found["told all: nearest"] == pytest.approx(
+        2 / 3
+    )  # the third is read as if it were the first
     both = slam_landmarks.ceilings(made([0, 1, 2], [0.0, 0.0, 0.0], place), marks)
     assert both["each once"] == 1.0  # but not where that one is read, too
 

@@ -108,7 +108,7 @@ class ElementBeliefs(NamedTuple):
     def agreed_since(
         self, earlier: ElementBeliefs, node: CompiledNode
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Flat places of the numbers that may be others than in earlier beliefs; means and variances there."""
+        """Flat places of numbers that may be others than in earlier beliefs, their means and variances."""
         one = self._replace(pool=self.pool.of_one())
         if node.name in self.missing or node.name in earlier.missing:
             every = np.arange(math.prod(node.value_shape))
