@@ -390,7 +390,7 @@ def draw(drive: Drive, readings: Readings, found: Any, kalman: Any, spread: np.n
     for place, cov in zip(found.mean("mark")[-1][met], spread[met], strict=True):
         ax.plot(*ellipse(place, cov, 3.0), color=picture.OTHER, lw=1.4)
         ax.plot(*place, ".", color=picture.OTHER)
-    ax.set(aspect="equal", xlabel="x in m", ylabel="y in m", title="landmarks with 3 sd ellipses")
+    ax.set(aspect="equal", xlabel="x in m", ylabel="y in m", title="landmarks, 3 sd given the path")
     low, high = drive.marks.min(axis=0) - 2.0, drive.marks.max(axis=0) + 2.0
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=4, fontsize=9)

@@ -70,9 +70,9 @@ def answers_of(
     first = block.slices[0].inner
     means[0], variances[0] = (a.reshape(-1) for a in first.agreed(node))
     for k in range(1, count):  # what nothing has written since is not worked out again
-        own, earlier = block.slices[k].inner, block.slices[k - 1].inner
+        inner, earlier = block.slices[k].inner, block.slices[k - 1].inner
         means[k], variances[k] = means[k - 1], variances[k - 1]
-        some, mean, variance = own.agreed_since(earlier, node)
+        some, mean, variance = inner.agreed_since(earlier, node)
         means[k, some], variances[k, some] = mean, variance
     errors = np.zeros(means.shape)
     if len(numbers):
