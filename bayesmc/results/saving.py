@@ -57,6 +57,8 @@ class RunFile(Saver):
         CheckpointError
             There is no room for it; all blocks are left as they are.
         """
+        if lazily is not None:
+            _take_in(answer, lazily)
         _write(answer, self.path, {"kind": ANSWER, "of": RUN}, lazily, self.header)
         self.finished = True
         if lazily is not None:
@@ -108,6 +110,19 @@ def _write(
         raise refused(path, error) from error
 
 
+def _take_in(answer: Any, lazily: Mapping[str, Any]) -> None:
+    """Hold what cannot be left in the file: draws that stand there in another form than they are kept in."""
+    places = _elsewhere(answer, lazily)
+    for name, lazy in lazily.items():
+        stored = answer._stored.get(name)
+        if isinstance(lazy, Lazy) and stored is not None and id(stored) not in places:
+            whole = np.empty(lazy.shape, lazy.dtype)
+            for where, piece in lazy.pieces():
+                whole[where] = piece
+            whole.flags.writeable = False
+            answer._stored[name] = whole
+
+
 def groups_of(
     answer: Any, elsewhere: Mapping[int, str], lazily: Mapping[str, Any] | None = None
 ) -> dict[str, Group]:
@@ -122,10 +137,11 @@ def groups_of(
         chains, draws = answer._shape
         axes = {"chain": range(chains)} | ({"draw": range(draws)} if lazily is None else {})
         groups[name] = Group(variables, {**axes, **coordinates})
-        diverged = getattr(answer, "divergences", None)
-        if diverged is not None:
-            both = Variable(("chain", "draw"), diverged)
-            groups["sample_stats"] = Group({"diverging": both}, axes)
+        told = {"diverging": "divergences", "energy": "energies"}
+        rows = {n: getattr(answer, own, None) for n, own in told.items()}
+        stats = {n: Variable(("chain", "draw"), v) for n, v in rows.items() if v is not None}
+        if stats:
+            groups["sample_stats"] = Group(stats, axes)
     else:
         found = _answers(answer, model)
         if found:
