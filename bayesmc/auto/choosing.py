@@ -17,6 +17,7 @@ from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import asking, is_worth_it
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.picks import picks_told, rows_of
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.refusals import common_refusal
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
@@ -108,7 +109,8 @@ def engine_for(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked
                 stacklevel=3,
             )
         return chosen.engine
-    reason = checked_engine(engine).refusal(problem)
+    with picks_told(problem.slices, rows_of(problem)):
+        reason = checked_engine(engine).refusal(problem)
     if reason is None:
         return engine  # what else it cannot do, its own method says best
     others = [c() for c in _CANDIDATES if not isinstance(engine, c)]
@@ -116,7 +118,7 @@ def engine_for(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked
     unable = [
         f"{type(o).__name__}()"
         for o in (*others, FactoredFrontier())
-        if f"{type(o).__name__}(" in reason and type(o) is not type(engine)
+        if f"{type(o).__name__}()" in reason and type(o) is not type(engine)
         if _why_not(o, problem, asked) is not None
     ]
     if unable:

@@ -17,6 +17,7 @@ from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.paths import Paths, forecast_from
+from bayesmc.engines.picks import picks_told, rows_of
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior
@@ -117,13 +118,15 @@ def filter(  # type: ignore[misc]
     if executor is not None and chosen.spreads:
         options["executor"] = executor
     if opened is None:
-        return chosen.filter(problem, seed_sequence(rng), **options)
+        with picks_told(problem.slices, rows_of(problem)):
+            return chosen.filter(problem, seed_sequence(rng), **options)
     seed = opened.seed(rng)
     file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
     if file is None:
         return answer
     if isinstance(chosen, ParticleFilter):
-        return chosen.filter(problem, seed, **options, checkpoint=file)
+        with picks_told(problem.slices, rows_of(problem)):
+            return chosen.filter(problem, seed, **options, checkpoint=file)
     found = chosen.filter(problem, seed, **options)
     if not getattr(found, "interrupted", False):
         file.finish(found)
@@ -310,7 +313,8 @@ def _smoothed(
     if engine is None and isinstance(chosen, ExpectationPropagation):
         return settled_or_kim(chosen, problem, queries, options["progress"])
     given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
-    return chosen.smooth(problem, seed, **given)
+    with picks_told(problem.slices, rows_of(problem)):
+        return chosen.smooth(problem, seed, **given)
 
 
 def _from_belief(

@@ -26,6 +26,7 @@ from bayesmc.dbn import (
 )
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
+from bayesmc.engines.picks import picks_told
 from bayesmc.engines.refusals import common_refusal
 from bayesmc.errors import (
     BayesmcError,
@@ -243,7 +244,7 @@ class FilterEngine:
         slices, row = read_row(
             belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
         )
-        with in_slice(row.t):
+        with in_slice(row.t), picks_told(slices, [row]):
             return self._absorbed(belief, slices, row)
 
     def unsupported(

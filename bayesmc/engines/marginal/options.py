@@ -212,6 +212,14 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         if elements is not None and not guided_node(slices, split, elements)[1]:
             return None
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
+        if wrong is not None and elements is not None:
+            found = {n: why_not_guided(slices, elements, n) for n in sampled}
+            whys = [f"{n!r} {why or 'is one of several'}" for n, why in found.items()]
+            return (
+                'ParticleFilter: with marginalize=, proposal="optimal" draws one vector given the row, which readings '
+                f"of {elements.states[0]!r} read, and what is sampled here is not that: {'; '.join(whys)}; give "
+                "proposal={...}, or leave it out"
+            )
         if wrong is not None:
             why = "which is sampled"
             if wrong in problem.series.observed:
@@ -366,10 +374,10 @@ def _joint_tangents(engine: Any, slices: Slices, split: Split, what: str) -> str
     count = math.prod(slices.first[name].plate_shape)
     asked = {"smooth": "smoothing", "fixed-lag": "lag="}.get(what, what)
     return (
-        f"ParticleFilter: {asked} would make all {count} elements of {name!r} linear together, at the mean of "
-        "their prior, and not each where its readings place it, as filter does; where that prior is vague they "
-        "would be placed anywhere. Ask filter without delay=, follow belief.ancestors for the way that was "
-        "taken, or give marginalize=None"
+        f"ParticleFilter: {asked} would make all {count} elements of {name!r} linear together, at the "
+        "mean of their prior, and not each where its readings place it, as filter does; where that prior is "
+        "vague they would be placed anywhere. Ask filter without delay=, follow belief.ancestors for the way "
+        "that was taken, or give marginalize=None"
     )
 
 

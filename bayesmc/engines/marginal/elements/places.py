@@ -1,15 +1,15 @@
 """Readings that are not linear over what they leave of a belief: its moments by importance sampling.
 
-A bearing alone leaves a wedge of a vague belief, a range alone a ring: no tangent holds over these, wherever it
-is taken. There points that lie evenly in the belief are moved to where readings fit, each becomes a Gaussian as
-wide as a tangent holds there, and the mixture of these is the proposal for the mean, the covariance and the
-evidence of the posterior. So a Gaussian is kept that has its moments, though not its shape. Points
-are the same for all particles and runs: answers about elements do not depend on chance.
+A bearing alone leaves a wedge of a vague belief, a range alone a ring: no tangent holds over these,
+wherever it is taken. There points that lie evenly in the belief are moved to where readings fit, each becomes a
+Gaussian as wide as a tangent holds there, and the mixture of these is the proposal for the mean, the covariance
+and the evidence of the posterior. So a Gaussian is kept that has its moments, though not its shape. Points are
+the same for all particles and runs: answers about elements do not depend on chance.
 
 References
 ----------
-Owen and Zhou (2000), Safe and effective importance sampling, JASA 95 (mixtures as proposals, weighed as
-a whole); Jazwinski (1970), Stochastic Processes and Filtering Theory, sec. 9.3 (densities kept by their moments).
+Owen and Zhou (2000), Safe and effective importance sampling, JASA 95 (mixtures as proposals, weighed as a
+whole); Jazwinski (1970), Stochastic Processes and Filtering Theory, sec. 9.3 (densities by their moments).
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ from bayesmc.engines.marginal.elements.updates import (
     whitened,
 )
 
-#: points that are moved, by numbers of an element, how far out they lie, and pairs of draws from the Gaussian at each
+#: points that are moved, by numbers of an element, how far out they lie, and pairs of draws from each Gaussian
 _POINTS, _OUT, _PAIRS = 32, 1.2, 2
-#: spread of these Gaussians beside the belief, how often it is halved, and by how much they are wider at last
+#: spread of these Gaussians beside the belief, how often it is halved, and how much wider they are at last
 _WIDE, _HALVINGS, _WIDER = 0.5, 5, 1.2
-#: standard deviations of the noise by which a tangent may be off within them, and from which a point has found nothing
+#: standard deviations of the noise by which a tangent may be off within them, and a reading at a point that fits
 _HELD, _FITS = 0.7, 4.0
 #: batches are worked through in parts of so many densities
 _BLOCK = 2_000_000
@@ -76,7 +76,7 @@ class Linear(NamedTuple):
     def conditioned(self, prior: Belief) -> tuple[Belief, np.ndarray]:
         """Beliefs given the rows, and log densities of these."""
         after, log = conditioned(prior, self.row, self.tangent)
-        if self.wild is None or self.after is None:
+        if self.wild is None or self.after is None or self.log is None:
             return after, log
         mean = np.where(self.wild[:, None], self.after.mean, after.mean)
         root = np.where(self.wild[:, None, None], self.after.root, after.root)
@@ -85,7 +85,7 @@ class Linear(NamedTuple):
     def log_predictive(self, prior: Belief) -> np.ndarray:
         """Log densities of the rows alone."""
         log = updates.log_predictive(prior, self.row, self.tangent)
-        return log if self.wild is None else np.where(self.wild, self.log, log)
+        return log if self.wild is None or self.log is None else np.where(self.wild, self.log, log)
 
 
 def linearised(prior: Belief, row: Row, at: At, bent: bool) -> Linear:
@@ -103,7 +103,11 @@ def linearised(prior: Belief, row: Row, at: At, bent: bool) -> Linear:
     for low in range(0, len(wild), part):
         own = wild[low : low + part]
         some = Belief(prior.mean[own], prior.root[own])
-        after, log[own], lost = moments(some, row.of(own), lambda x, i, own=own: at(x, own[i]))
+
+        def at_own(x: np.ndarray, which: np.ndarray, own: np.ndarray = own) -> Tangent:
+            return at(x, own[which])
+
+        after, log[own], lost = moments(some, row.of(own), at_own)
         mean[own], root[own] = after.mean, after.root
         is_wild[own[lost]] = False
     return Linear(found, turned, is_wild, Belief(mean, root), log)
@@ -162,7 +166,7 @@ def moments(prior: Belief, row: Row, at: At) -> tuple[Belief, np.ndarray, np.nda
 
 @cache
 def _even(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Points the same always: where to begin, ``(k, n)``, and what is drawn at each, ``(k, d, n)``, in pairs."""
+    """Points, always the same: where to begin, ``(k, n)``, and what is drawn at each, ``(k, d, n)``."""
     count = _POINTS * n
     root = np.max(np.roots([1.0, *([0.0] * (n - 1)), -1.0, -1.0]).real)  # Roberts' sequence
     steps = root ** -np.arange(1.0, n + 1)

@@ -23,8 +23,8 @@ from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.kalman.data import given_values, pattern_of
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.elements.beliefs import ElementBeliefs
-from bayesmc.engines.marginal.elements.plan import ElementPlan, Group
 from bayesmc.engines.marginal.elements.places import linearised
+from bayesmc.engines.marginal.elements.plan import ElementPlan, Group
 from bayesmc.engines.marginal.elements.pool import Pool
 from bayesmc.engines.marginal.elements.rows import GroupRow, Looking, present_in
 from bayesmc.engines.marginal.elements.updates import Belief, Tangent
