@@ -216,9 +216,9 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
             found = {n: why_not_guided(slices, elements, n) for n in sampled}
             whys = [f"{n!r} {why or 'is one of several'}" for n, why in found.items()]
             return (
-                'ParticleFilter: with marginalize=, proposal="optimal" draws one vector given the row, which readings '
-                f"of {elements.states[0]!r} read, and what is sampled here is not that: {'; '.join(whys)}; give "
-                "proposal={...}, or leave it out"
+                'ParticleFilter: with marginalize=, proposal="optimal" draws one vector given the row, which '
+                f"readings of {elements.states[0]!r} read, and what is sampled here is not that: "
+                f"{'; '.join(whys)}; give proposal={{...}}, or leave it out"
             )
         if wrong is not None:
             why = "which is sampled"

@@ -1,7 +1,7 @@
 """Readings of a vector that is drawn with a look at the row, which read no element: a compass, a GPS.
 
-They weigh the vector by their density; what they say of where it is drawn is what is left of their means, made linear
-in it. Where a mean has no known derivative they weigh alone.
+They weigh the vector by their density, and lead where it is drawn by their means, made linear in it. Where a
+mean has no known derivative they weigh alone.
 """
 
 from __future__ import annotations

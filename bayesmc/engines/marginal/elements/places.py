@@ -1,10 +1,10 @@
 """Readings that are not linear over what they leave of a belief: its moments by importance sampling.
 
-A bearing alone leaves a wedge of a vague belief, a range alone a ring: no tangent holds over these,
-wherever it is taken. There points that lie evenly in the belief are moved to where readings fit, each becomes a
-Gaussian as wide as a tangent holds there, and the mixture of these is the proposal for the mean, the covariance
-and the evidence of the posterior. So a Gaussian is kept that has its moments, though not its shape. Points are
-the same for all particles and runs: answers about elements do not depend on chance.
+A bearing alone leaves a wedge of a vague belief, a range alone a ring: no tangent holds over these, wherever
+it is taken. There points that lie evenly in the belief are moved to where readings fit, each becomes a
+Gaussian as wide as a tangent holds there, and the mixture of these is the proposal for the mean, the
+covariance and the evidence of the posterior. So a Gaussian is kept that has its moments, though not its shape.
+Points are the same for all particles and runs: answers about elements do not depend on chance.
 
 References
 ----------
@@ -35,11 +35,11 @@ from bayesmc.engines.marginal.elements.updates import (
     whitened,
 )
 
-#: points that are moved, by numbers of an element, how far out they lie, and pairs of draws from each Gaussian
+#: points that are moved, by numbers of an element, how far out they lie, and pairs of draws from Gaussians
 _POINTS, _OUT, _PAIRS = 32, 1.2, 2
 #: spread of these Gaussians beside the belief, how often it is halved, and how much wider they are at last
 _WIDE, _HALVINGS, _WIDER = 0.5, 5, 1.2
-#: standard deviations of the noise by which a tangent may be off within them, and a reading at a point that fits
+#: standard deviations of the noise by which a tangent may be off in them, and a reading at a point that fits
 _HELD, _FITS = 0.7, 4.0
 #: batches are worked through in parts of so many densities
 _BLOCK = 2_000_000

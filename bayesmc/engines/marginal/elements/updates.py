@@ -1,10 +1,10 @@
 """Gaussian beliefs about single elements conditioned on what picks them, many at a time.
 
-Means of readings are made linear at the mean of the belief, as the extended Kalman filter does. Where the belief
-is so vague that such a tangent does not hold over what it leaves of the belief (a landmark met for the first
-time), it is taken at the mode instead, found by Gauss and Newton: the iterated extended Kalman filter, which is
-Laplace's method. So a first sight is placed by what is read, whatever the prior mean is. Where the tangent at the
-mode does not hold, either, ``places`` goes on.
+Means of readings are made linear at the mean of the belief, as the extended Kalman filter does. Where the
+belief is so vague that such a tangent does not hold over what it leaves of the belief (a landmark met for the
+first time), it is taken at the mode instead, found by Gauss and Newton: the iterated extended Kalman filter,
+which is Laplace's method. So a first sight is placed by what is read, whatever the prior mean is. Where the
+tangent at the mode does not hold, either, ``places`` goes on.
 
 References
 ----------
@@ -26,8 +26,8 @@ from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.means import absorbed
 from bayesmc.linalg.square_root import condition_many
 
-#: standard deviations of the noise that a tangent may be off by where it is tried, and of what it leaves of the
-#: belief, at which it is tried
+#: standard deviations of the noise that a tangent may be off by, and those of what it leaves of a belief
+#: at which it is tried
 HELD, _ENDS = 0.5, 1.5
 #: standard deviations of the noise that a tangent may change by along one of the belief
 _STEEP = 1e6
@@ -179,7 +179,7 @@ def whitened(noise: np.ndarray, off: np.ndarray, present: np.ndarray) -> np.ndar
 
 
 def is_smooth(found: Tangent, root: np.ndarray) -> np.ndarray:
-    """Where there is a tangent: there is none where a reading turns within nothing, as a bearing at no range."""
+    """Where there is a tangent: none is where a reading turns within nothing, as a bearing at no range."""
     steep = np.abs(found.slopes @ root).max(axis=(-2, -1), initial=0.0)
     finite = np.isfinite(found.mean).all(axis=-1) & np.isfinite(steep)
     sizes = np.abs(np.diagonal(found.noise, 0, -2, -1)).min(axis=-1)
