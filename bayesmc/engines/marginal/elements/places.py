@@ -3,7 +3,7 @@
 A bearing alone leaves a wedge of a vague belief, a range alone a ring: no tangent holds over these, wherever
 it is taken. There points that lie evenly in the belief are moved to where readings fit, each becomes a
 Gaussian as wide as a tangent holds there, and the mixture of these is the proposal for the mean, the
-covariance and the evidence of the posterior. So a Gaussian is kept that has its moments, though not its shape.
+covariance and the evidence of the posterior. So a Gaussian is kept that has its moments, but not its shape.
 Points are the same for all particles and runs: answers about elements do not depend on chance.
 
 References
