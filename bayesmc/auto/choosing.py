@@ -12,12 +12,11 @@ from bayesmc.auto.switching import REASON, why_too_long, within_budget
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import asking, is_worth_it
 from bayesmc.engines.particles.filter import ParticleFilter
-from bayesmc.engines.picks import picks_told, rows_of
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.refusals import common_refusal
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
@@ -109,7 +108,7 @@ def engine_for(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked
                 stacklevel=3,
             )
         return chosen.engine
-    with picks_told(problem.slices, rows_of(problem)):
+    with picks_told(problem.slices, problem.series):
         reason = checked_engine(engine).refusal(problem)
     if reason is None:
         return engine  # what else it cannot do, its own method says best

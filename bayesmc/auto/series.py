@@ -14,10 +14,9 @@ from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.paths import Paths, forecast_from
-from bayesmc.engines.picks import picks_told, rows_of
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior
@@ -118,14 +117,14 @@ def filter(  # type: ignore[misc]
     if executor is not None and chosen.spreads:
         options["executor"] = executor
     if opened is None:
-        with picks_told(problem.slices, rows_of(problem)):
+        with picks_told(problem.slices, problem.series):
             return chosen.filter(problem, seed_sequence(rng), **options)
     seed = opened.seed(rng)
     file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
     if file is None:
         return answer
     if isinstance(chosen, ParticleFilter):
-        with picks_told(problem.slices, rows_of(problem)):
+        with picks_told(problem.slices, problem.series):
             return chosen.filter(problem, seed, **options, checkpoint=file)
     found = chosen.filter(problem, seed, **options)
     if not getattr(found, "interrupted", False):
@@ -313,7 +312,7 @@ def _smoothed(
     if engine is None and isinstance(chosen, ExpectationPropagation):
         return settled_or_kim(chosen, problem, queries, options["progress"])
     given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
-    with picks_told(problem.slices, rows_of(problem)):
+    with picks_told(problem.slices, problem.series):
         return chosen.smooth(problem, seed, **given)
 
 

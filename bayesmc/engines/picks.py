@@ -2,40 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import Row, SeriesProblem, Slices
-from bayesmc.errors import EvidenceError
+from bayesmc.dbn import Row, Slices
+from bayesmc.dbn.series import Series
 from bayesmc.expression import Program
 from bayesmc.network.model import Model
 from bayesmc.structure.picked import picked_element
 
 
-@contextmanager
-def picks_told(slices: Slices, rows: Iterable[Row]) -> Iterator[None]:
-    """Has an index that is outside of a plate say which input it comes from, in which of some rows.
-
-    Raises
-    ------
-    EvidenceError
-    """
-    try:
-        yield
-    except IndexError as error:
-        for row in rows:
-            why = _outside(slices.model(row.t), row.inputs)
-            if why is not None:
-                raise EvidenceError(f"slice {row.t}: {why}") from error
-        raise
-
-
-def rows_of(problem: SeriesProblem) -> Iterator[Row]:
-    """The rows of a series, one after the other."""
-    return (problem.series.row(k) for k in range(problem.steps))
+def pick_outside(slices: Slices, rows: Series | Sequence[Row]) -> str | None:
+    """Which input of a row picks an element that is outside of its plate, and what to do, or None."""
+    every = rows if isinstance(rows, Sequence) else (rows.row(k) for k in range(rows.steps))
+    for row in every:
+        why = _outside(slices.model(row.t), row.inputs)
+        if why is not None:
+            return f"slice {row.t}: {why}"
+    return None
 
 
 # ---- private ------------------------------------------------------------------------------------
