@@ -103,6 +103,16 @@ def test_points_say_what_a_tangent_says_where_that_holds() -> None:
     assert moments(*far[:3])[2].all() and np.isfinite(linearised(*far).conditioned(far[0])[1]).all()
 
 
+def test_a_range_in_space_leaves_a_sphere() -> None:
+    """Of radius r its coordinates have mean 0 and standard deviation r / sqrt(3)."""
+    prior = Belief(np.zeros((1, 3)), 10 * np.eye(3)[None])
+    row = Row(np.array([[6.0]]), np.ones((1, 1), bool), np.zeros(1, bool))
+    after, _, lost = moments(prior, row, range_at)
+    size = 6 / np.sqrt(3)
+    assert not lost.any() and np.abs(after.mean[0]).max() < 0.15 * size
+    assert np.abs(np.log(np.sqrt(np.square(after.root[0]).sum(-1)) / size)).max() < 0.15
+
+
 def net(mean: Any, scale: float, looks: int = 1) -> bmc.DynamicBayesNet:
     start = PoseNormal(np.zeros(3), scale_diag=[1e-3] * 3)
     dbn = bmc.DynamicBayesNet(plates={"mark": 2, "look": looks})

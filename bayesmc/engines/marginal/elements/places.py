@@ -35,7 +35,7 @@ from bayesmc.engines.marginal.elements.updates import (
     whitened,
 )
 
-#: points that are moved, by numbers of an element, how far out they lie, and pairs of draws from Gaussians
+#: points that are moved (of one number), how far out they lie, and pairs of draws from Gaussians
 _POINTS, _OUT, _PAIRS = 32, 1.2, 2
 #: spread of these Gaussians beside the belief, how often it is halved, and how much wider they are at last
 _WIDE, _HALVINGS, _WIDER = 0.5, 5, 1.2
@@ -99,7 +99,7 @@ def linearised(prior: Belief, row: Row, at: At, bent: bool) -> Linear:
     mean, root = np.array(prior.mean), np.array(prior.root)
     log, is_wild = np.zeros(len(mean)), ~holds
     n = mean.shape[-1]
-    part = max(1, _BLOCK // (2 * _PAIRS * (_POINTS * n) ** 2 * n))
+    part = max(1, _BLOCK // (2 * _PAIRS * _count(n) ** 2 * n))
     for low in range(0, len(wild), part):
         own = wild[low : low + part]
         some = Belief(prior.mean[own], prior.root[own])
@@ -164,15 +164,20 @@ def moments(prior: Belief, row: Row, at: At) -> tuple[Belief, np.ndarray, np.nda
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _count(n: int) -> int:
+    """Points for an element of so many numbers: what readings leave of it may be a surface of one less."""
+    return _POINTS * 2 ** min(n * (n - 1) // 2, 4)
+
+
 @cache
 def _even(n: int) -> tuple[np.ndarray, np.ndarray]:
     """Points, always the same: where to begin, ``(k, n)``, and what is drawn at each, ``(k, d, n)``."""
-    count = _POINTS * n
+    count = _count(n)
     root = np.max(np.roots([1.0, *([0.0] * (n - 1)), -1.0, -1.0]).real)  # Roberts' sequence
     steps = root ** -np.arange(1.0, n + 1)
     every = np.arange(1, count * _PAIRS + 1)[:, None]
     starts, draws = (ndtri((shift + every * steps) % 1.0) for shift in (0.5, 0.37))
-    starts = starts[:count] - starts[:count].mean(axis=0)
+    starts = np.concatenate([starts[: count // 2], -starts[: count // 2]])
     starts *= _OUT / np.sqrt(np.square(starts).mean(axis=0))
     draws = draws.reshape(_PAIRS, count, n).swapaxes(0, 1)
     draws = np.concatenate([draws, -draws], axis=1)
