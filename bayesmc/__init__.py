@@ -194,8 +194,11 @@ __all__ = [
 ]
 
 
+_LATER = ("io", "markov", "montecarlo", "plotting", "robotics", "sklearn", "testing", "vision")
+
+
 def __getattr__(name: str) -> Any:
     """What not every program needs loads when first asked for."""
-    if name in ("io", "markov", "montecarlo", "plotting", "robotics", "testing", "vision"):
+    if name in _LATER:
         return importlib.import_module(f"bayesmc.{name}")
     raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")

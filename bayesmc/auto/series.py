@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from typing import Any, overload
 
 import numpy as np
 
 from bayesmc.auto.choosing import checked_engine, engine_for
 from bayesmc.auto.files import Opened
-from bayesmc.auto.several import is_several, several
+from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
+from bayesmc.dbn.calendar import last_times
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
@@ -49,11 +51,12 @@ def filter(  # type: ignore[misc]
     Parameters
     ----------
     dbn : DynamicBayesNet
-    observations : dict
+    observations : dict or DataFrame
         Node -> its rows, time first, shape ``(time, *plates, *event)``. Row k belongs to slice k; NaN, a
-        masked entry or None is missing. Static nodes are given without time. A list of such dicts is one of
-        independent series, each with an answer of its own.
-    inputs : dict, optional
+        masked entry or None is missing. Static nodes are given without time. Of a data frame (pandas, polars,
+        pyarrow) columns are nodes and inputs, and its index or a column of dates labels the slices
+        (``.times``). A list of such is one of independent series, each with an answer of its own.
+    inputs : dict or DataFrame, optional
         Input -> its rows, time first; of several series a list of such, or one for all.
     engine : optional
         ``ParticleFilter(particles)``, ...; None chooses (see ``explain``).
@@ -67,7 +70,8 @@ def filter(  # type: ignore[misc]
         stated, in ``.queries_mcse``.
     checkpoint : path or CheckpointFile, optional
         A file in which a particle filter saves itself as the slices pass (the extra ``netcdf``), and other
-        filters their answer; the same call goes on where the run was, with the same bits (see ``infer``).
+        filters their answer; the same call goes on where the run was, with the same bits (see ``infer``). Of
+        a list of series a folder, in which series k has the file ``series<k>.nc``.
     executor : concurrent.futures.Executor, optional
         Who works out units of work: series of a list, islands of an ``IslandFilter``. The same seed gives
         the same bits with any, and with none.
@@ -104,32 +108,14 @@ def filter(  # type: ignore[misc]
         check_executor("filter", executor)
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
     if not isinstance(observations, Mapping) and is_several(observations):
-        if checkpoint is not None:
-            raise ValueError("filter(checkpoint=): a file holds one series; filter them one by one")
-        quiet, seed = {**options, "progress": False}, seed_sequence(rng)
-        return several(
-            "filter", _filtered, dbn, observations, inputs, engine, seed, quiet, progress, executor
-        )
+        folder = None if checkpoint is None else Folder("filter", checkpoint)
+        quiet, seed = {**options, "progress": False}, seed_of(folder, rng)
+        engine = folder.engine if engine is None and folder is not None else engine
+        work = progress, executor, folder
+        return several("filter", _filtered, dbn, observations, inputs, engine, seed, quiet, *work)
     problem = pose_series(dbn, observations, inputs)
-    opened = None if checkpoint is None else Opened("filter", checkpoint, problem)
-    engine = opened.engine if engine is None and opened is not None else engine
-    chosen = engine_for(problem, engine, Asked("filter", keep, read_queries("filter", queries)))
-    if executor is not None and chosen.spreads:
-        options["executor"] = executor
-    if opened is None:
-        with picks_told(problem.slices, problem.series):
-            return chosen.filter(problem, seed_sequence(rng), **options)
-    seed = opened.seed(rng)
-    file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
-    if file is None:
-        return answer
-    if isinstance(chosen, ParticleFilter):
-        with picks_told(problem.slices, problem.series):
-            return chosen.filter(problem, seed, **options, checkpoint=file)
-    found = chosen.filter(problem, seed, **options)
-    if not getattr(found, "interrupted", False):
-        file.finish(found)
-    return found
+    own = None if rng is None else seed_sequence(rng)
+    return _filtered(problem, engine, own, {**options, "checkpoint": checkpoint}, executor)
 
 
 @overload
@@ -198,16 +184,17 @@ def smooth(  # type: ignore[misc]
         )
     problem = pose_series(dbn, observations, inputs)
     found = _smoothed(problem, engine, seed_sequence(rng), options)
+    observations, inputs, found.times = dbn.unframed(observations, inputs)
     found.paths = Paths(problem, observations, inputs)
     return found
 
 
 def forecast(
     dbn: DynamicBayesNet | OnlineBelief,
-    observations: Mapping[str, Any] | None = None,
+    observations: Any = None,
     *,
     steps: int,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -240,18 +227,20 @@ def forecast(
             "forecast: give the observations so far, or a belief in place of the template"
         )
     problem = pose_series(dbn, observations, inputs, ahead=steps)
+    observations, inputs, times = dbn.unframed(observations, inputs)
     chosen = engine_for(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+    found.times = last_times(times, problem.steps, steps)
     found.paths = Paths(problem, observations, inputs)
     return found
 
 
 def most_likely(
     dbn: DynamicBayesNet,
-    observations: Mapping[str, Any],
+    observations: Any,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -280,12 +269,42 @@ def most_likely(
 def _filtered(
     problem: SeriesProblem,
     engine: FilterEngine | None,
-    seed: np.random.SeedSequence,
+    seed: np.random.SeedSequence | None,
     options: dict[str, Any],
+    executor: Any = None,
 ) -> SeriesPosterior:
+    """One series; without a seed by that of its file, or a new one."""
+    checkpoint = options.get("checkpoint")
+    options = {n: v for n, v in options.items() if n != "checkpoint"}
+    opened = None
+    if checkpoint is not None:
+        opened = Opened("filter", checkpoint, problem, engine is not None)
+    engine = opened.engine if engine is None and opened is not None else engine
     queries = read_queries("filter", options["queries"])
     chosen = engine_for(problem, engine, Asked("filter", options["keep"], queries))
-    return chosen.filter(problem, seed, **options)
+    if executor is not None and chosen.spreads:
+        options["executor"] = executor
+    if seed is None:
+        seed = seed_sequence(None) if opened is None else opened.seed(None)
+    found: SeriesPosterior
+    if opened is None:
+        with picks_told(problem.slices, problem.series):
+            found = chosen.filter(problem, seed, **options)
+        found.times = problem.times
+        return found
+    file, answer = opened.begin(chosen, seed, options["keep"], {"queries": options["queries"]})
+    if file is None:
+        found = answer
+        found.times = problem.times
+        return found
+    with closing(file):
+        more: dict[str, Any] = {"checkpoint": file} if chosen.saves else {}
+        with picks_told(problem.slices, problem.series):
+            found = chosen.filter(problem, seed, **options, **more)
+        found.times = problem.times
+        if not chosen.saves and not getattr(found, "interrupted", False):
+            file.finish(found)
+    return found
 
 
 def _smoothed(

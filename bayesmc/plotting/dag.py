@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn.two_slices import TwoSlices
+from bayesmc.drawing.layout import Layout, Point, Rectangle, layered_layout
 from bayesmc.network import BayesNet, Node
-from bayesmc.plotting.layout import Layout, Point, Rectangle, layered_layout
 from bayesmc.plotting.pyplot import pyplot
-from bayesmc.plotting.template import TwoSlices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

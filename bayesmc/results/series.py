@@ -20,6 +20,7 @@ from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.posterior import quantile_levels
 from bayesmc.results.saving import save
 from bayesmc.results.series_checks import SeriesChecks
+from bayesmc.results.shown import ShownSeries
 from bayesmc.results.statistics import table_variance
 
 #: what is asked of answers over time that has another name here, or that only some filters have
@@ -42,7 +43,7 @@ _INSTEAD = {
 }
 
 
-class SeriesPosterior(SeriesChecks, MarginalAnswers):
+class SeriesPosterior(SeriesChecks, MarginalAnswers, ShownSeries):
     """Beliefs about the nodes of every slice.
 
     Attributes
@@ -54,8 +55,11 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     steps : int
     start : int
         The slice that the first entry belongs to.
+    times : ndarray or None, shape (time,)
+        What labels the slices in the data (dates), where they said.
     log_marginal_likelihood : float or ndarray
-        Log density of all rows; one for each element of the plates that are filtered separately.
+        Log density of all rows; one for each element of the plates that are filtered separately. Given static
+        nodes that are known, whose own densities are not part of it (of ``infer`` on a template they are).
     log_marginal_increments : ndarray, shape (time,) or (time, *plates)
         Log density of each row given those before; they add up to the above.
     log_marginal_likelihood_mcse : float, ndarray or None
@@ -95,6 +99,7 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     [[0.182, 0.818], [0.117, 0.883]]
     """
 
+    times: np.ndarray | None = None
     weight_ess: np.ndarray | None = None
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None
