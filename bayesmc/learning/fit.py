@@ -100,7 +100,7 @@ def fit(
     Nodes are found by quasi-Newton steps on the log evidence in unconstrained coordinates, with the gradient
     of the expression graph where everything else hidden is finite, and by differences of exact evidences
     elsewhere; standard errors are those of the observed information. Tables are found by expectation-
-    maximisation, whose objective never falls.
+    maximisation with extrapolated steps, whose objective never falls.
 
     References
     ----------

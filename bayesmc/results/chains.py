@@ -43,6 +43,9 @@ class _Chains(Posterior):
     renewals: Mapping[str, np.ndarray] = MappingProxyType({})
     #: draws whose Hamiltonian trajectory diverged, shape (chain, draw); None without such, or without draws
     divergences: np.ndarray | None = None
+    #: energy (minus log density, with momenta) of each draw's Hamiltonian trajectory, shape (chain, draw);
+    #: None without such, or where several kernels make some
+    energies: np.ndarray | None = None
     #: a sentence where chains name components differently that the model does not tell apart
     label_switching: str | None = None
 

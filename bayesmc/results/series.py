@@ -31,7 +31,6 @@ _INSTEAD = {
     "samples": 'a ParticleFilter has particles(name), with keep="particles"',
     "particles": "a ParticleFilter has those",
     "summary": "mean(name), std(name) and quantile(name, q) are arrays, time first",
-    "plot": "mean(name), std(name) and quantile(name, q) are arrays, time first, to plot",
     "density": "a GridFilter has those",
     "grid": "a GridFilter has those",
     "pairs": "a DiscreteFilter has those",
