@@ -194,9 +194,7 @@ def call(
         raise ModelError(f"node {name!r}: {_explain(error, arguments)}") from error
 
 
-def to_mix(
-    declaration: Declaration, parents: Sequence[str], plate: str, how: str = "sum"
-) -> str:
+def to_mix(declaration: Declaration, parents: Sequence[str], plate: str, how: str = "sum") -> str:
     """The lines that mix the elements of a plate, for a node of that plate that does so itself."""
     rest = tuple(p for p in declaration.plates if p != plate)
     plates = f", plates={rest if len(rest) > 1 else rest[0]!r}" if rest else ""
@@ -205,8 +203,8 @@ def to_mix(
     others = ", ".join(dict.fromkeys([*parents, total]))
     return (
         "to mix elements (a mean, a cumulative sum), use an unplated deterministic node that reads the "
-        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.{how}({plate!r}){plates}), and read that: "
-        f"lambda {others}: ... in {declaration.name!r}"
+        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.{how}({plate!r}){plates}), and read "
+        f"that: lambda {others}: ... in {declaration.name!r}"
     )
 
 
