@@ -232,15 +232,23 @@ class ShapeSpace:
 
     def lines(self, state: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Points along the outlines of states and unit normals there, both shape (..., count, 2)."""
+        points, normals, _ = self._lines(state, count)
+        return points, normals
+
+    def _lines(self, state: Any, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The same, and how much of the outline each stands for, (..., count): 1 on average of the template."""
         state = self._checked(state)
         at, along = self.template._at(count)
         apart = at @ self.template.control - self.template.center
         turned = np.swapaxes(self._matrix(state), -1, -2)
         points = apart @ turned + (state[..., :2] + self.template.center)[..., None, :]
-        tangents = (along @ self.template.control) @ turned
+        directions = along @ self.template.control
+        tangents = directions @ turned
         normals = np.stack([tangents[..., 1], -tangents[..., 0]], axis=-1)
-        length = np.sqrt(np.vecdot(normals, normals))[..., None]
-        return points, normals / np.where(length > 0, length, 1.0)
+        length = np.sqrt(np.vecdot(normals, normals))
+        normals /= np.where(length > 0, length, 1.0)[..., None]
+        typical = np.hypot(*directions.T).mean()
+        return points, normals, length / (typical if typical > 0 else 1.0)
 
     def basis(self, count: int) -> np.ndarray:
         """How points along the outline move with the state, shape (count, 2, size): linear throughout."""
