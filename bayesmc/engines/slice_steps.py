@@ -333,14 +333,15 @@ class WeighSeen:
         self, model: Model, node: CompiledNode, seen: Observed, apart: tuple[str, ...]
     ) -> None:
         assert seen.mask is not None
-        self.model, self.node, self.seen, self.apart = model, node, seen, apart
+        self.model, self.node, self.seen, self.apart = model, node, seen.value, apart
+        self.elements = seen.mask
         mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
         self.value = read_only(np.where(mask, seen.value, np.nan))
 
     def __call__(self, state: Pass) -> None:
-        dist = current_distribution(self.model, self.node, state, drawn=~self.seen.mask)
-        log = self.model.log_density(self.node.name, dist, self.seen.value)
-        state.weigh(summed(np.where(self.seen.mask, log, 0.0), self.node, self.apart))
+        dist = current_distribution(self.model, self.node, state, drawn=~self.elements)
+        log = self.model.log_density(self.node.name, dist, self.seen)
+        state.weigh(summed(np.where(self.elements, log, 0.0), self.node, self.apart))
         state.values[self.node.name] = self.value
 
 

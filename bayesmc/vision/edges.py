@@ -50,7 +50,9 @@ class ContourEdges:
     ``reach`` and in the frame. In the middle of a frame it is 1, all but. A line outside the frame was not
     searched, and counts 1: it says neither that the outline is there nor that it is not. So outlines of
     which different parts are in the frame compare with each other, and with one that is out of sight, whose
-    log density is 0. The log density is the sum of the logarithms over the normals, times ``tempering``.
+    log density is 0. The log density is the sum of the logarithms over the normals, times ``tempering``,
+    each by the length of the outline that it stands for, in lengths of the template's: normals that crowd
+    together on an outline that has shrunk see the same edge, and it counts once.
 
     Parameters
     ----------
@@ -259,9 +261,9 @@ class ContourEdges:
         )
         if away > max(self._reach, math.hypot(width, height)):
             raise ModelError(
-                f"ContourEdges: all of {len(states)} outlines are {away:.3g} px or more off the picture, which "
-                f"spans x 0 to {width - 1} and y 0 to {height - 1} px; no normal reaches that far: is the "
-                "start given in pixels, as (x, y), and where the template is?"
+                f"ContourEdges: all of {len(states)} outlines are {away:.3g} px or more off the picture, "
+                f"which spans x 0 to {width - 1} and y 0 to {height - 1} px; no normal reaches that far: is "
+                "the start given in pixels, as (x, y), and where the template is?"
             )
         warnings.warn(
             "ContourEdges: none of several outlines is in the picture, so that a frame weighs all of them "

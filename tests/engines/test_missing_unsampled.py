@@ -1,4 +1,4 @@
-"""Rows that are missing of a node that nobody can draw: weighed where they are seen, and left out where not."""
+"""Missing rows of a node that nobody can draw: weighed where they are seen, and left out where not."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def test_what_is_not_seen_weighs_nothing(plate: bool) -> None:
         found.log_marginal_likelihood, exact.log_marginal_likelihood,
         atol=5 * found.log_marginal_likelihood_mcse,
     )  # fmt: skip
-    with pytest.raises(UnsupportedError, match="'y' is not answered .* has no sampler has no value"):
+    with pytest.raises(
+        UnsupportedError, match="'y' is not answered .* has no sampler has no value"
+    ):
         found.mean("y")
 
 
@@ -71,6 +73,4 @@ def test_what_is_read_must_still_be_drawn() -> None:
     dbn = drift(True)
     dbn.add("z", lambda y: bmc.Normal(y, 1.0))
     with pytest.raises(UnsupportedError, match="pass sample="):
-        bmc.filter(
-            dbn, {"y": SERIES, "z": np.zeros(8)}, engine=bmc.ParticleFilter(50), rng=0
-        )
+        bmc.filter(dbn, {"y": SERIES, "z": np.zeros(8)}, engine=bmc.ParticleFilter(50), rng=0)

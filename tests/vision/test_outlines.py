@@ -86,6 +86,14 @@ def test_contours_that_are_none_are_refused() -> None:
             Contour(control)
     with pytest.raises(ParameterError, match="one spot"):
         Contour(np.ones((5, 2)))
+    for axes in (3, (1.0, 2.0, 3.0)):
+        with pytest.raises(ShapeError, match="semi_axes is .* a pair of numbers"):
+            Contour.ellipse((0.0, 0.0), axes)
+    for axes in ((3.0, 0.0), (-3.0, 2.0)):
+        with pytest.raises(ParameterError, match="semi_axes must be positive"):
+            Contour.ellipse((0.0, 0.0), axes)
+    with pytest.raises(ParameterError, match="center must be finite"):
+        Contour.ellipse((0.0, np.nan), (3.0, 3.0))
     with pytest.raises(ParameterError, match="'affine'"):
         ShapeSpace(CIRCLE, "projective")
     with pytest.raises(ShapeError, match="6 components"):
@@ -116,6 +124,8 @@ def test_dynamics_that_cannot_be_learned_are_refused() -> None:
         fit_dynamics(np.zeros((20, 2)))
     with pytest.raises(ParameterError, match="damping"):
         SecondOrder.steady(2, 1.0, damping=2.0)
+    with pytest.raises(ShapeError, match=r"noise has shape \(2,\); give one number, or 6"):
+        SecondOrder.steady(6, noise=[1.0, 2.0])
     running = 1.2 ** np.arange(30)[:, None] + 0.1 * np.random.default_rng(0).normal(size=(30, 1))
     assert fit_dynamics(running).is_stable  # and does not run away
 
@@ -163,7 +173,9 @@ def test_an_outline_that_is_half_out_is_found_there_and_not_squeezed_into_the_fr
     edges = ContourEdges(ShapeSpace(CIRCLE, "affine"), (60, 80))
     squeezed = [[dx, 0.0, 38.0 - dx - 15.0 + grown, 0.0, 0.0, 0.0]
                 for dx in (26.0, 29.0, 32.0, 35.0) for grown in (-2.0, 0.0, 2.0)]  # fmt: skip
-    states = np.array([[38.0, 0, 0, 0, 0, 0], *squeezed, [28.0, 0, 0, 0, 0, 0], [70.0, 0, 0, 0, 0, 0]])
+    states = np.array(
+        [[38.0, 0, 0, 0, 0, 0], *squeezed, [28.0, 0, 0, 0, 0, 0], [70.0, 0, 0, 0, 0, 0]]
+    )
     log = edges.given(states).log_prob(disc_at)
     assert log[0] > log[1:].max() + 0.5 and log[-1] == 0.0
 
