@@ -7,7 +7,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 PY = .venv/bin/python
 PIP_FLAGS = --disable-pip-version-check -q
 
-.PHONY: help demo test test-thorough mutants alarms lint format counts docs bench peers references clean
+.PHONY: help demo test test-thorough mutants alarms lint format counts docs site dist bench speed peers references clean
 .NOTPARALLEL:
 
 help:
@@ -20,7 +20,10 @@ help:
 	@echo "make format  let ruff mend formatting and import order"
 	@echo "make counts  count lines, the modules that a call runs in, and the functions that are followed"
 	@echo "make docs    run every snippet of README, docs and docstrings, and build the site: out/site"
+	@echo "make site    build the site alone"
+	@echo "make dist    build wheel and sdist, check them, and ask the wheel a question in an empty environment"
 	@echo "make bench   time bayesmc beside hand-written code (and peers, after 'make peers')"
+	@echo "make speed   write docs/speed.md from what some of the benchmarks measure"
 	@echo "make peers   install the packages that the benchmarks compare with, in .venv-peers"
 	@echo "make references  hold bayesmc against BUGS and posteriordb, beside JAGS and PyMC: docs/accuracy.md (long)"
 	@echo "make clean   remove what the other targets made"
@@ -57,13 +60,35 @@ format: .venv/.extras-dev
 counts: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.counts
 
-docs: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test .venv/.extras-plot,arviz,robotics,vision,docs
+# Warnings are errors, and so are links that lead nowhere. Without a network the links into other projects' pages are left out.
+SITE = OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -q -W --keep-going -b html docs out/site && \
+	$(PY) docs/links.py out/site && echo "the site is in out/site/index.html"
+
+docs: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,docs
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
-	OPENBLAS_NUM_THREADS=1 $(PY) -m sphinx -q -W --keep-going -b html docs out/site
-	@echo "the site is in out/site/index.html"
+	$(SITE)
+
+site: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,docs
+	$(SITE)
+
+# What is released: both archives are built and checked, and the wheel is asked a question where nothing else is.
+dist: .venv/.extras-dev
+	rm -rf dist build/release
+	$(PY) -m build -q
+	$(PY) -m twine check --strict dist/*
+	$(PY) -m venv build/release
+	build/release/bin/python -m pip install $(PIP_FLAGS) dist/*.whl
+	cd build/release && bin/python -W error -c 'import bayesmc as bmc; net = bmc.BayesNet(); \
+		net.add("k", bmc.Bernoulli(0.25)); net.add("x", lambda k: bmc.Normal(2.0 * k, 1.0)); \
+		found = bmc.infer(net, {"x": 1.0}).mean("k"); assert abs(found - 0.25) < 1e-12, found; \
+		print("bayesmc", bmc.__version__, "answers from its wheel")'
+	@ls -l dist
 
 bench: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
 	$(PY) -m benchmarks
+
+speed: .venv/.extras-plot,arviz,netcdf,robotics,vision,fast,test
+	$(PY) -m benchmarks.page
 
 peers: .venv-peers/.installed
 

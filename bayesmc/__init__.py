@@ -93,7 +93,7 @@ from bayesmc.structure.log_density import log_density
 if TYPE_CHECKING:
     from bayesmc import io, markov, montecarlo
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "Affine",

@@ -278,6 +278,10 @@ class EngineWarning(BayesmcWarning):
     """An option has another engine answer than would without it, or an engine leaves something out."""
 
 
+class CheckpointWarning(BayesmcWarning):
+    """A function reads something whose content a file of a run cannot be held against."""
+
+
 class WorkerWarning(BayesmcWarning):
     """A worker of an executor was lost; what it was at is run again."""
 

@@ -65,6 +65,13 @@ def child(seed: np.random.SeedSequence, unit: int) -> np.random.SeedSequence:
     return np.random.SeedSequence(seed.entropy, spawn_key=key, pool_size=seed.pool_size)
 
 
+def parent(seed: np.random.SeedSequence) -> np.random.SeedSequence:
+    """The seed that one made by ``child`` came from."""
+    return np.random.SeedSequence(
+        seed.entropy, spawn_key=seed.spawn_key[:-2], pool_size=seed.pool_size
+    )
+
+
 def resumed(state: Any) -> np.random.Generator:
     """A generator that goes on where another one of ``stream`` was; ``state`` is its bit generator's."""
     bits = np.random.SFC64(_ANY)

@@ -1,5 +1,6 @@
-"""Memory of long runs: ``python -m benchmarks.memory`` prints it at a tenth, a half and the end of each.
+"""Memory of long runs: ``python -m benchmarks.memory`` prints it on the way and at the end of each.
 
+``python -m benchmarks.memory --steps`` has online filters take in a million rows each, some minutes in all.
 Memory of the process itself is counted (anonymous pages), not pages of files, which the system takes back.
 """
 
@@ -7,8 +8,10 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +38,7 @@ class Watch:
 
     def advance(self, count: int = 1) -> None:
         self.at += count
-        for share in (0.1, 0.5, 1.0):
+        for share in (0.01, 0.1, 0.5, 1.0):
             if share not in self.found and self.at >= share * self.total:
                 self.found[share] = anonymous()
 
@@ -82,11 +85,11 @@ def in_file(watch: Watch) -> None:
     Saver.save = plain  # type: ignore[method-assign]
 
 
-def online(watch: Watch) -> None:
+def online(watch: Watch, engine: Any = None) -> None:
+    engine = bmc.ParticleFilter(100) if engine is None else engine
     dbn = bmc.DynamicBayesNet()
     dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
     dbn.add("y", lambda x: bmc.Normal(x, 0.5))
-    engine = bmc.ParticleFilter(100)
     belief, rng = engine.start(dbn, rng=0), np.random.default_rng(0)
     x = 0.0
     for _ in range(watch.total):
@@ -108,19 +111,42 @@ RUNS: dict[str, tuple[Callable[[Watch], None], int]] = {
     "online steps": (online, 10**6),
     "calls of infer": (calls, 10**5),
 }
+#: particles, the same with answers that come late, and a Kalman filter
+ONLINE = {
+    "100 particles": bmc.ParticleFilter(100),
+    "100 particles, 5 rows late": bmc.ParticleFilter(100, delay=5),
+    "KalmanFilter": bmc.KalmanFilter(),
+}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--share", type=float, default=1.0, help="of the numbers that are stated")
     parser.add_argument("--only", default="")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        nargs="?",
+        const=10**6,
+        metavar="N",
+        help="online steps alone, so many (10^6) by each of several filters",
+    )
     given = parser.parse_args()
     warnings.simplefilter("ignore")
+    if given.steps is not None:
+        for name, engine in ONLINE.items():
+            tell(partial(online, engine=engine), f"online steps, {name}", given.steps)
+        return
     for name, (run, total) in chosen(given.only):
-        watch = Watch(max(10, int(total * given.share)))
-        run(watch)
-        told = ", ".join(f"{100 * s:.0f} %: {m:.0f} MiB" for s, m in watch.found.items())
-        print(f"{watch.total} {name}: {told}", flush=True)
+        tell(run, name, max(10, int(total * given.share)))
+
+
+def tell(run: Callable[[Watch], None], name: str, total: int) -> None:
+    """Memory at some shares of a run, and how long it took."""
+    watch, begun = Watch(total), time.process_time()
+    run(watch)
+    told = ", ".join(f"at {s * total:.0f}: {m:.1f} MiB" for s, m in watch.found.items())
+    print(f"{total} {name}: {told}; {time.process_time() - begun:.0f} s", flush=True)
 
 
 def chosen(only: str) -> Iterator[tuple[str, tuple[Callable[[Watch], None], int]]]:

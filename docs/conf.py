@@ -6,10 +6,11 @@ tests before; examples run here, with few draws, and what they print and draw is
 
 from __future__ import annotations
 
+import http.client
 import os
 import shutil
-import socket
 import sys
+import urllib.request
 from pathlib import Path
 
 DOCS = Path(__file__).resolve().parent
@@ -31,6 +32,7 @@ extensions = [
     "sphinx.ext.autosummary",
     "sphinx.ext.intersphinx",
     "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",  # formulas are set where there is no network, too
     "numpydoc",
     "sphinx_gallery.gen_gallery",
     "sphinx_design",
@@ -50,6 +52,7 @@ html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_theme = "pydata_sphinx_theme"
 html_title = "bayesmc"
+html_sidebars = {"coming/*": []}  # two columns of code want the whole width
 html_show_sourcelink = False
 html_theme_options = {
     "navbar_align": "left",
@@ -59,27 +62,36 @@ html_theme_options = {
     "footer_start": ["copyright"],
     "footer_end": ["theme-version"],
 }
+mathjax_path = "mathjax/tex-chtml.js"
 suppress_warnings = ["config.cache", "sphinx_gallery.space_in_filename"]
 
-#: other projects' objects, where a network can be reached
-INVENTORIES = {
-    "python": ("https://docs.python.org/3", None),
-    "numpy": ("https://numpy.org/doc/stable", None),
-    "scipy": ("https://docs.scipy.org/doc/scipy", None),
-    "matplotlib": ("https://matplotlib.org/stable", None),
-    "networkx": ("https://networkx.org/documentation/stable", None),
+#: other projects' pages
+NEIGHBOURS = {
+    "python": "https://docs.python.org/3",
+    "numpy": "https://numpy.org/doc/stable",
+    "scipy": "https://docs.scipy.org/doc/scipy",
+    "matplotlib": "https://matplotlib.org/stable",
+    "networkx": "https://networkx.org/documentation/stable",
 }
 
 
-def _reached(host: str) -> bool:
-    try:
-        socket.create_connection((host, 443), timeout=2.0).close()
-    except OSError:
-        return False
-    return True
+def _inventories() -> dict[str, tuple[str, str]]:
+    """Lists of what neighbours have pages on, as far as they can be fetched: to lack one is no warning."""
+    folder, found = ROOT / "out" / "inventories", {}
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, page in NEIGHBOURS.items():
+        try:
+            with urllib.request.urlopen(f"{page}/objects.inv", timeout=3.0) as answer:
+                text = answer.read()
+        except (OSError, http.client.HTTPException):
+            continue
+        if text.startswith(b"# Sphinx inventory version"):
+            (folder / name).write_bytes(text)
+            found[name] = (page, str(folder / name))
+    return found
 
 
-intersphinx_mapping = INVENTORIES if _reached("docs.python.org") else {}
+intersphinx_mapping = _inventories()
 
 write_pages(DOCS / "api")
 SOURCES = gallery_sources(ROOT / "examples", DOCS / "_gallery")

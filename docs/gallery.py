@@ -9,7 +9,6 @@ from __future__ import annotations
 import ast
 import re
 import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,13 @@ from sphinx_gallery.scrapers import figure_rst
 
 #: scripts of that folder that show nothing by themselves
 HELPERS = re.compile(r"^(__init__|demo|picture|reference|compare|data_.*|rendered)$")
-OUT = Path(tempfile.mkdtemp(prefix="gallery"))
+#: where a script writes, seen from its own folder: what it prints then shows no path of this machine
+OUT = "out"
+#: how words of file names are written
+WORDS = {
+    word.lower(): word
+    for word in ("Faithful", "Gibbs", "GNP", "Ising", "Merwe", "MPI", "Nile", "SLAM", "TrueSkill")
+}
 #: what a picture has to be for a page to show it
 SHOWN = (".png", ".gif")
 
@@ -46,7 +51,7 @@ class Arguments:
         return "Arguments"
 
     def __call__(self, _: Any, variables: dict[str, Any]) -> list[str]:
-        return ["--fast", "--out", str(OUT / Path(variables["src_file"]).stem)]
+        return ["--fast", "--out", OUT]
 
 
 class Pictures:
@@ -56,7 +61,7 @@ class Pictures:
         return "Pictures"
 
     def __call__(self, _: Any, variables: dict[str, Any], conf: dict[str, Any]) -> str:
-        folder, paths = OUT / Path(variables["src_file"]).stem, variables["image_path_iterator"]
+        folder, paths = Path(variables["src_file"]).parent / OUT, variables["image_path_iterator"]
         taken = []
         for path in sorted(folder.glob("*")):
             if path.suffix in SHOWN:
@@ -68,7 +73,8 @@ class Pictures:
 
 def _with_heading(stem: str, text: str) -> str:
     """The name of the file in words above its docstring."""
-    title = stem.replace("_", " ").capitalize()
+    title = " ".join(WORDS.get(word, word) for word in stem.split("_"))
+    title = title[0].upper() + title[1:]
     doc = ast.get_docstring(ast.parse(text), clean=False) or ""
     rest = text.split('"""', 2)[2]
     return f'r"""\n{title}\n{"=" * len(title)}\n\n{_as_markup(doc)}\n"""{rest}'

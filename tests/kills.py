@@ -13,6 +13,7 @@ import hashlib
 import mmap
 import os
 import resource
+import shutil
 import signal
 import sys
 import tempfile
@@ -32,6 +33,8 @@ from bayesmc.storage import Blocks, Saver, open_image
 
 #: seconds between blocks
 EVERY = 0.01
+#: where in the memory that a run shares its answer begins
+_SAID = 512
 
 
 def mixture() -> tuple[Any, dict[str, Any]]:
@@ -72,7 +75,7 @@ def walk(static: bool, steps: int) -> tuple[Any, dict[str, Any]]:
 class Case:
     """A question, and how it is asked."""
 
-    make: Callable[[], tuple[Any, dict[str, Any]]]
+    make: Callable[[], tuple[Any, Any]]
     engine: Any
     ask: Callable[..., Any] = bmc.infer
     options: dict[str, Any] = field(default_factory=dict)
@@ -95,6 +98,10 @@ def cases(size: float = 1.0) -> dict[str, Case]:
     def series() -> tuple[Any, dict[str, Any]]:
         return walk(False, many(1500))
 
+    def several() -> tuple[Any, list[dict[str, Any]]]:
+        dbn, seen = walk(False, many(700))
+        return dbn, [seen, {"y": seen["y"][: many(400)]}]
+
     filter_ = bmc.ParticleFilter(300, compiled=False)
     particle = bmc.ParticleGibbs(many(60), warmup=many(30), chains=2, particles=20)
     metropolis = bmc.ParticleMetropolis(many(60), warmup=many(60), chains=2, particles=30)
@@ -108,6 +115,16 @@ def cases(size: float = 1.0) -> dict[str, Case]:
         "particle filter": Case(series, filter_, bmc.filter),
         "particle Gibbs": Case(lambda: walk(True, 12), particle),
         "particle Metropolis": Case(lambda: walk(True, 12), metropolis),
+        "particle filter, late": Case(series, bmc.ParticleFilter(100, delay=4), bmc.filter),
+        "Gibbs, in groups": Case(
+            mixture, bmc.Gibbs(many(600), warmup=many(200), chains=4, groups=2)
+        ),
+        "Hamiltonian, in groups, in the file": Case(
+            regression,
+            bmc.HamiltonianMonteCarlo(many(60), warmup=many(60), chains=4, groups=2),
+            options={"keep": "file"},
+        ),
+        "several series": Case(several, filter_, bmc.filter),
         "Gibbs, in the file": Case(
             mixture, bmc.Gibbs(many(600), warmup=many(200)), options={"keep": "file"}
         ),
@@ -118,7 +135,9 @@ def cases(size: float = 1.0) -> dict[str, Case]:
 
 
 def bits(answer: Any) -> str:
-    """All that an answer says, to the last bit."""
+    """All that an answer says, to the last bit; all answers of a list."""
+    if isinstance(answer, list):
+        return " ".join(map(bits, answer))
     found = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -150,14 +169,15 @@ class Child:
             self._run(case, limit)
 
     @property
-    def saved(self) -> int:
-        """Blocks that are saved for sure."""
-        return int.from_bytes(self._shared[:8], "little")
+    def saved(self) -> dict[str, int]:
+        """Blocks that are saved for sure, by the name of the file."""
+        text = self._shared[:_SAID].rstrip(b"\0").decode()
+        return {line.split()[0]: int(line.split()[1]) for line in text.splitlines()}
 
     @property
     def said(self) -> str:
         """The bits of its answer, or its error."""
-        return self._shared[8:].rstrip(b"\0").decode()
+        return self._shared[_SAID:].rstrip(b"\0").decode()
 
     def wait(self) -> int:
         """Its exit status."""
@@ -174,11 +194,13 @@ class Child:
         return os.WIFSIGNALED(self.wait())
 
     def _run(self, case: Case, limit: int | None) -> None:
-        plain = Saver.save
+        plain, counts = Saver.save, dict[str, int]()
 
         def save(saver: Saver, rows: Any, state: Any) -> None:
             plain(saver, rows, state)
-            self._shared[:8] = saver.blocks.count.to_bytes(8, "little")
+            counts[saver.path.name] = saver.blocks.count
+            text = "".join(f"{name} {count:06d}\n" for name, count in counts.items())
+            self._shared[: len(text)] = text.encode()
 
         status = 1
         try:
@@ -192,18 +214,36 @@ class Child:
             if not isinstance(error, (CheckpointError, DamagedFileError)):
                 traceback.print_exc()
         data = told.encode()[:3000]
-        self._shared[8 : 8 + len(data)] = data
+        self._shared[_SAID : _SAID + len(data)] = data
         os._exit(status)
 
 
-def check_file(path: Path, saved: int) -> None:
-    """A file is one that can be read, with all blocks that were saved."""
-    if not path.exists():
-        assert saved == 0, f"{path}: {saved} blocks are gone"
-        return
-    if open_image(path).attributes["kind"] == "run":
-        found = Blocks(path).count
-        assert found >= saved, f"{path}: {found} blocks of {saved}"
+def files(path: Path) -> list[Path]:
+    """All that a run has left: its own file and those of its parts."""
+    return [p for p in sorted(path.parent.rglob("*")) if p.is_file() and not p.name.startswith(".")]
+
+
+def clear(path: Path) -> None:
+    """Leave nothing of a run."""
+    for own in path.parent.iterdir():
+        shutil.rmtree(own) if own.is_dir() else own.unlink()
+
+
+def check_files(path: Path, saved: dict[str, int]) -> None:
+    """All files can be read, with all blocks that were saved."""
+    found = {own.name: own for own in files(path)}
+    kinds = {name: open_image(own).attributes["kind"] for name, own in found.items()}
+    ended = kinds.get(path.name) == "answer"  # then those of groups are gone
+    for name, count in saved.items():
+        assert ended or name in found, f"{name}: {count} blocks are gone"
+    for name, own in found.items():
+        if kinds[name] == "run":
+            there, count = Blocks(own).count, saved.get(name, 0)
+            assert there >= count, f"{own}: {there} blocks of {count}"
+        check_tree(own)
+
+
+def check_tree(path: Path) -> None:
     try:
         import xarray
     except ImportError:
@@ -228,24 +268,24 @@ def trial(case: Case, path: Path, kills: int, rng: np.random.Generator) -> dict[
     seconds = (time.monotonic() - begun) / 2
     wanted = whole.said
     same, ended, done, resumed = [once.said == wanted], 1, 0, 0
-    path.unlink()
+    clear(path)
     while done < kills:
         child = Child(case, path)
         if child.killed_after(float(rng.uniform(0.0, 0.7 * seconds))):
             done += 1
-            check_file(path, child.saved)
+            check_files(path, child.saved)
             resumed += path.exists()
             continue
         same.append(child.said == wanted)
         ended += 1
-        path.unlink()
+        clear(path)
     last = Child(case, path)
     assert last.wait() == 0, last.said
     again = Child(case, path)  # which reads the answer
     assert again.wait() == 0, again.said
     same += [last.said == wanted, again.said == wanted]
-    size = path.stat().st_size
-    path.unlink()
+    size = sum(own.stat().st_size for own in files(path))
+    clear(path)
     return {"kills": done, "ended": ended + 1, "resumed": resumed, "same": all(same), "bytes": size}
 
 
@@ -253,19 +293,20 @@ def full_disk(case: Case, path: Path, rng: np.random.Generator, times: int) -> b
     """Whether a run whose disk is full says so, keeps its file, and goes on to the same bits."""
     whole = Child(case, path)
     assert whole.wait() == 0, whole.said
-    largest, wanted = path.stat().st_size, whole.said
-    path.unlink()
+    left = len(files(path))
+    largest, wanted = max(own.stat().st_size for own in files(path)), whole.said
+    clear(path)
     for _ in range(times):
         limit = int(rng.uniform(0.05, 1.0) * largest)
         child = Child(case, path, limit)
         if child.wait():
             assert child.said.startswith("CheckpointError"), child.said
-            check_file(path, child.saved)
+            check_files(path, child.saved)
         ended = Child(case, path)
         assert ended.wait() == 0, ended.said
-        if ended.said != wanted or len(list(path.parent.iterdir())) > 1:
+        if ended.said != wanted or len(list(path.parent.iterdir())) > 1 or len(files(path)) > left:
             return False
-        path.unlink()
+        clear(path)
     return True
 
 
@@ -275,18 +316,16 @@ def cut_off(case: Case, path: Path, rng: np.random.Generator, times: int) -> tup
     assert whole.wait() == 0, whole.said
     kept = 0
     for _ in range(times):
-        while not path.exists() or Blocks(path).count < 3:
-            path.unlink(missing_ok=True)
+        while not (begun := [own for own in files(path) if in_blocks(own)]):
+            clear(path)
             Child(case, path).killed_after(float(rng.uniform(0.2, 1.5)))
-            if path.exists() and open_image(path).attributes["kind"] != "run":
-                path.unlink()
-        image = open_image(path)  # what lies behind its end was on its way, and is no loss
-        os.truncate(path, int(rng.integers(image.size, image.end)))
+        target = begun[int(rng.integers(len(begun)))]
+        image = open_image(target)  # what lies behind its end was on its way, and is no loss
+        os.truncate(target, int(rng.integers(image.size, image.end)))
         child = Child(case, path)
         if child.wait() == 0 or not child.said.startswith("DamagedFileError"):
             return False, kept
-        found = Blocks(path, repair=True).count
-        kept += found
+        kept += Blocks(target, repair=True).count
         net, seen = case.make()
         file = bmc.CheckpointFile(path, every=EVERY, repair=True)
         with warnings.catch_warnings():
@@ -294,8 +333,13 @@ def cut_off(case: Case, path: Path, rng: np.random.Generator, times: int) -> tup
             answer = case.ask(net, seen, engine=case.engine, rng=7, **case.options, checkpoint=file)
         if bits(answer) != whole.said:
             return False, kept
-        path.unlink()
+        clear(path)
     return True, kept
+
+
+def in_blocks(path: Path) -> bool:
+    """Whether a file is of a run that goes on, with some blocks."""
+    return open_image(path).attributes["kind"] == "run" and Blocks(path).count >= 3
 
 
 def main() -> None:
@@ -317,7 +361,7 @@ def main() -> None:
             full = full_disk(case, path, rng, 5)
             cut, kept = cut_off(case, path, rng, 5)
             print(
-                f"{name:22s} {found['kills']} kills, {found['resumed']} with a file; "
+                f"{name:36s} {found['kills']} kills, {found['resumed']} with a file; "
                 f"{found['ended']} runs ended, "
                 f"bits {'equal' if found['same'] else 'DIFFER'}; disk full: {'equal' if full else 'DIFFER'}; "
                 f"cut off: {'equal' if cut else 'DIFFER'} ({kept} blocks kept)",

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from tests.snippets import REPOSITORY, refresh, run_page, snippets
 
-PAGES = [REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
+PAGES = [REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+HEADING = re.compile(r"^#{1,6} +(.+?) *$", re.MULTILINE)
+FENCED = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: "-".join(page.parts[-2:]))
 def test_page_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)  # a snippet may write files
     first = page.read_text("utf-8").partition("\n")[0]
@@ -27,18 +30,39 @@ def test_tour_has_snippets() -> None:
 
 
 def test_links_between_pages_hold() -> None:
-    broken = [
-        f"{page.name}: {target}"
-        for page in [*PAGES, REPOSITORY / "README.md"]
-        for target in _local_links(page.read_text("utf-8"))
-        if not (page.parent / target).exists()
-    ]
+    pages = [*PAGES, REPOSITORY / "README.md", REPOSITORY / "CHANGELOG.md"]
+    broken = [f"{page.name}: {target}" for page in pages for target in _broken_links(page)]
     assert broken == []
 
 
-def _local_links(text: str) -> list[str]:
-    targets = [part.split(")")[0].split("#")[0] for part in text.split("](")[1:]]
-    return [target for target in targets if target and "://" not in target]
+def test_broken_links_are_found(tmp_path: Path) -> None:
+    page, other = tmp_path / "page.md", tmp_path / "other.md"
+    other.write_text("# Two words, `code`\n\n```python\n# no heading\n```\n", "utf-8")
+    good = ["other.md", "other.md#two-words-code", "#here", "https://example.org/none.md"]
+    bad = ["none.md", "other.md#three-words", "other.md#no-heading", "#there"]
+    page.write_text("# Here\n\n" + " ".join(f"[x]({target})" for target in good + bad), "utf-8")
+    assert _broken_links(page) == bad
+
+
+def _broken_links(page: Path) -> list[str]:
+    """Targets of a page's links that are no file, or no heading of it; those elsewhere are not looked up."""
+    text = FENCED.sub("", page.read_text("utf-8"))
+    targets = [part.split(")")[0] for part in text.split("](")[1:]]
+    return [target for target in targets if "://" not in target and not _leads(page, target)]
+
+
+def _leads(page: Path, target: str) -> bool:
+    name, _, anchor = target.partition("#")
+    file = page.parent / name if name else page
+    if not file.exists():
+        return False
+    return not anchor or anchor in _anchors(file.read_text("utf-8"))
+
+
+def _anchors(text: str) -> set[str]:
+    """Where headings can be led to: their words, joined by hyphens, as GitHub and the site name them."""
+    headings = HEADING.findall(FENCED.sub("", text))
+    return {re.sub(r"[^\w\- ]", "", found.lower()).replace(" ", "-") for found in headings}
 
 
 @pytest.mark.parametrize(

@@ -18,13 +18,14 @@ from bayesmc.dbn import DynamicBayesNet, SeriesProblem
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import CheckpointError, FileFormatError, ModelError, UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph, Problem
-from bayesmc.network.fingerprint import Fingerprint, digest, evidence_fingerprint, fingerprint
+from bayesmc.network.digest import digest
+from bayesmc.network.fingerprint import Fingerprint, evidence_fingerprint, fingerprint
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior, RunFile
-from bayesmc.results.saving import ANSWER, RUN, observed_variables
+from bayesmc.results.run_files import answer_in, difference, header_in, made, remove_units
+from bayesmc.results.saving import ANSWER, RUN
 from bayesmc.states import StateArray
-from bayesmc.storage import CheckpointFile, Group, open_image, packed, unpacked, write_image
-from bayesmc.storage.blocks import refused
+from bayesmc.storage import CheckpointFile, open_image, unpacked
 from bayesmc.storage.image import Stored, libraries
 
 #: what can be told of a value in a message
@@ -72,6 +73,11 @@ def load(
     0.5
     """
     path = Path(path)
+    if path.is_dir():
+        raise FileFormatError(
+            f"{path}: that is a folder; of several series each has a file in it: bmc.load(folder / "
+            '"series0.nc")'
+        )
     image = open_image(path)
     kind = image.attributes.get("kind")
     if kind == RUN:
@@ -93,19 +99,28 @@ class Opened:
         ``"infer"`` or ``"filter"``.
     checkpoint : path or CheckpointFile
     problem : Problem or SeriesProblem
+    named : bool
+        Whether the call names its engine, which then is that of all questions asked with it.
     """
 
-    def __init__(self, call: str, checkpoint: Any, problem: Problem | SeriesProblem) -> None:
-        self.call, self.problem = call, problem
+    def __init__(
+        self, call: str, checkpoint: Any, problem: Problem | SeriesProblem, named: bool = False
+    ) -> None:
+        self.call, self.problem, self.named = call, problem, named
         self.file = CheckpointFile.of(checkpoint)
         self.path = Path(self.file.path)
         libraries()
+        if self.path.is_dir():
+            raise CheckpointError(
+                f"{call}(checkpoint={str(self.path)!r}): that is a folder; give the path of a file, such as "
+                f"{str(self.path / 'run.nc')!r}"
+            )
         self.header: Mapping[str, Any] | None = None
         self.image = None
         if self.path.exists():
             self.image = open_image(self.path)
-            self.header = unpacked(self.image.packed, _nothing)["header"]
-            if not self.header or "identity" not in self.header:
+            self.header = header_in(self.image)
+            if "identity" not in self.header:
                 raise CheckpointError(
                     f"{call}(checkpoint={str(self.path)!r}): the file holds an answer that was saved, and "
                     "no run; give another path (bmc.load reads it)"
@@ -139,50 +154,37 @@ class Opened:
             The file is of another run; the message says what differs.
         """
         identity = _identity(self.problem, engine, seed, {"keep": keep, **more})
+        if self.header is not None and engine is self.header["engine"]:
+            own = f"{type(engine).__name__}("  # options that are the file's own, whatever they came back as
+            was = self.header["identity"]
+            identity |= {what: told for what, told in was.items() if what.startswith(own)}
+        header: Mapping[str, Any] = self.header or {
+            "identity": identity, "engine": engine, "seed": seed, "keep": keep, "named": self.named,
+        }  # fmt: skip
         if self.header is None:
-            header = self._made(identity, engine, seed, keep)
+            made(self.path, self.problem, header)
+            self.image = open_image(self.path)
+            was = header_in(self.image)["identity"]  # another process may have come first
         else:
-            header = self.header
-            if why := _difference(header["identity"], identity):
-                raise CheckpointError(
-                    f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; "
-                    "make the same call to go on with it, or give another path"
-                )
-            if self.image is not None and self.image.attributes["kind"] == ANSWER:
-                with suppress(UnsupportedError):  # of an approximation, which is made again
-                    return Begun(None, self._answer(keep))
-        return Begun(RunFile(self.file, header), None)
-
-    # ---- private -------------------------------------------------------------------------------
-
-    def _made(
-        self, identity: Fingerprint, engine: Any, seed: np.random.SeedSequence, keep: Any
-    ) -> Mapping[str, Any]:
-        problem = self.problem
-        header = {"identity": identity, "engine": engine, "seed": seed, "keep": keep}
-        groups: dict[str, Group] = {}
-        held: dict[str, Any] = dict(header)
-        if isinstance(problem, Problem):
-            model = problem.model
-            coordinates = {p: model.labels.get(p, range(n)) for p, n in model.sizes.items()}
-            groups["observed_data"] = Group(
-                observed_variables(model, problem.observed), coordinates
+            was = header["identity"]
+        if why := difference(was, identity):
+            raise CheckpointError(
+                f"{self.call}(checkpoint={str(self.path)!r}): the file belongs to another run: {why}; "
+                "make the same call to go on with it, or give another path"
             )
-            held |= {"observed": problem.observed, "inputs": problem.inputs}
-            held["model"] = model.without_functions()
-        try:
-            write_image(self.path, groups, packed({"header": held}), {"kind": RUN})
-        except OSError as error:
-            raise refused(self.path, error) from error
-        return header
-
-    def _answer(self, keep: Any) -> Any:
-        spilled = keep == "file" or isinstance(keep, Mapping)
-        assert self.image is not None
-        answer = unpacked(self.image.packed, Stored(self.path, mapped=spilled))["answer"]
-        if isinstance(answer, Posterior) and isinstance(self.problem, Problem):
-            answer.bind(self.problem)
-        return answer
+        if self.image is not None and self.image.attributes["kind"] == ANSWER:
+            remove_units(self.path, identity)  # where the process ended before it could
+            spilled = keep == "file" or isinstance(keep, Mapping)
+            with suppress(UnsupportedError):  # of an approximation, which is made again
+                return Begun(None, answer_in(self.path, self.image, self.problem, spilled))
+        run = RunFile(self.file, header)
+        ended = run.blocks.image.attributes["kind"] == ANSWER
+        if ended and (self.image is None or self.image.attributes["kind"] != ANSWER):
+            raise CheckpointError(
+                f"{self.call}(checkpoint={str(self.path)!r}): another process has just ended this run; make "
+                "the same call for its answer"
+            )
+        return Begun(run, None)
 
 
 class Begun(NamedTuple):
@@ -193,11 +195,6 @@ class Begun(NamedTuple):
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _nothing(name: str) -> np.ndarray:
-    """In the place of arrays that nobody looks at."""
-    return np.empty(0)
 
 
 def _identity(
@@ -236,24 +233,11 @@ def _identity(
 
 
 def _shown(value: Any) -> str:
+    value = dict(value) if isinstance(value, Mapping) else value  # files know no other mappings
     simple = value is None or isinstance(value, (bool, int, float, str))
     plain = simple or (isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value))
     text = repr(list(value) if isinstance(value, tuple) else value) if plain else ""
     return f"={text}" if plain and len(text) <= _SHOWN else digest(value)
-
-
-def _difference(was: Fingerprint, now: Fingerprint) -> str | None:
-    """The first thing in which two runs differ, in words."""
-    for what in (*was, *(w for w in now if w not in was)):
-        a, b = was.get(what), now.get(what)
-        if a == b:
-            continue
-        if a is None or b is None:
-            return f"{what} is {'not there any more' if b is None else 'new'}"
-        if a.startswith("=") and b.startswith("="):
-            return f"{what} was {a[1:]} and is {b[1:]} now"
-        return f"{what} is another one"
-    return None
 
 
 def _so_far(path: Any) -> tuple[Any, Mapping[str, Any]]:
@@ -289,7 +273,7 @@ def _with_net(path: Any, answer: Any, header: Mapping[str, Any], net: Any) -> An
     problem = pose_any(net, evidence, inputs or None)
     was = header.get("fingerprint", header.get("identity", {}))
     now = fingerprint(problem.model)
-    if why := _difference({k: v for k, v in was.items() if k in now}, now) if was else None:
+    if why := difference({k: v for k, v in was.items() if k in now}, now) if was else None:
         raise CheckpointError(
             f"load({str(path)!r}, net=...): the answer is about another net: {why}"
         )

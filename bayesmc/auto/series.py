@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from typing import Any, overload
 
 import numpy as np
 
 from bayesmc.auto.choosing import checked_engine, engine_for
 from bayesmc.auto.files import Opened
-from bayesmc.auto.several import is_several, several
+from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
@@ -67,7 +68,8 @@ def filter(  # type: ignore[misc]
         stated, in ``.queries_mcse``.
     checkpoint : path or CheckpointFile, optional
         A file in which a particle filter saves itself as the slices pass (the extra ``netcdf``), and other
-        filters their answer; the same call goes on where the run was, with the same bits (see ``infer``).
+        filters their answer; the same call goes on where the run was, with the same bits (see ``infer``). Of
+        a list of series a folder, in which series k has the file ``series<k>.nc``.
     executor : concurrent.futures.Executor, optional
         Who works out units of work: series of a list, islands of an ``IslandFilter``. The same seed gives
         the same bits with any, and with none.
@@ -104,30 +106,14 @@ def filter(  # type: ignore[misc]
         check_executor("filter", executor)
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
     if not isinstance(observations, Mapping) and is_several(observations):
-        if checkpoint is not None:
-            raise ValueError("filter(checkpoint=): a file holds one series; filter them one by one")
-        quiet, seed = {**options, "progress": False}, seed_sequence(rng)
-        return several(
-            "filter", _filtered, dbn, observations, inputs, engine, seed, quiet, progress, executor
-        )
+        folder = None if checkpoint is None else Folder("filter", checkpoint)
+        quiet, seed = {**options, "progress": False}, seed_of(folder, rng)
+        engine = folder.engine if engine is None and folder is not None else engine
+        work = progress, executor, folder
+        return several("filter", _filtered, dbn, observations, inputs, engine, seed, quiet, *work)
     problem = pose_series(dbn, observations, inputs)
-    opened = None if checkpoint is None else Opened("filter", checkpoint, problem)
-    engine = opened.engine if engine is None and opened is not None else engine
-    chosen = engine_for(problem, engine, Asked("filter", keep, read_queries("filter", queries)))
-    if executor is not None and chosen.spreads:
-        options["executor"] = executor
-    if opened is None:
-        return chosen.filter(problem, seed_sequence(rng), **options)
-    seed = opened.seed(rng)
-    file, answer = opened.begin(chosen, seed, keep, {"queries": queries})
-    if file is None:
-        return answer
-    if isinstance(chosen, ParticleFilter):
-        return chosen.filter(problem, seed, **options, checkpoint=file)
-    found = chosen.filter(problem, seed, **options)
-    if not getattr(found, "interrupted", False):
-        file.finish(found)
-    return found
+    own = None if rng is None else seed_sequence(rng)
+    return _filtered(problem, engine, own, {**options, "checkpoint": checkpoint}, executor)
 
 
 @overload
@@ -278,12 +264,36 @@ def most_likely(
 def _filtered(
     problem: SeriesProblem,
     engine: FilterEngine | None,
-    seed: np.random.SeedSequence,
+    seed: np.random.SeedSequence | None,
     options: dict[str, Any],
+    executor: Any = None,
 ) -> SeriesPosterior:
+    """One series; without a seed by that of its file, or a new one."""
+    checkpoint = options.get("checkpoint")
+    options = {n: v for n, v in options.items() if n != "checkpoint"}
+    opened = None
+    if checkpoint is not None:
+        opened = Opened("filter", checkpoint, problem, engine is not None)
+    engine = opened.engine if engine is None and opened is not None else engine
     queries = read_queries("filter", options["queries"])
     chosen = engine_for(problem, engine, Asked("filter", options["keep"], queries))
-    return chosen.filter(problem, seed, **options)
+    if executor is not None and chosen.spreads:
+        options["executor"] = executor
+    if seed is None:
+        seed = seed_sequence(None) if opened is None else opened.seed(None)
+    if opened is None:
+        return chosen.filter(problem, seed, **options)
+    file, answer = opened.begin(chosen, seed, options["keep"], {"queries": options["queries"]})
+    if file is None:
+        found: SeriesPosterior = answer
+        return found
+    with closing(file):
+        if chosen.saves:
+            return chosen.filter(problem, seed, **options, checkpoint=file)  # type: ignore[call-arg]
+        found = chosen.filter(problem, seed, **options)
+        if not getattr(found, "interrupted", False):
+            file.finish(found)
+    return found
 
 
 def _smoothed(

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
-from bayesmc.errors import BayesmcError, EvidenceError
-from bayesmc.randomness import child
+from bayesmc.errors import BayesmcError, CheckpointError, EvidenceError
+from bayesmc.randomness import child, parent, seed_sequence
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.run_files import header_in
+from bayesmc.storage import CheckpointFile, PartFile, open_image
 from bayesmc.workers import completed
 from bayesmc.workers.units import gathered, workers_of
 
@@ -29,6 +32,61 @@ def is_several(observations: Any) -> bool:
     return all(isinstance(one, Mapping) for one in observations)
 
 
+class Folder:
+    """Where several series save themselves, each in a file of its own, as if it were asked about alone.
+
+    Parameters
+    ----------
+    call : str
+        ``"filter"``.
+    checkpoint : path or CheckpointFile
+        Of a folder, made where there is none.
+
+    Raises
+    ------
+    CheckpointError
+        It is a file, or cannot be made.
+    """
+
+    def __init__(self, call: str, checkpoint: Any) -> None:
+        self.file = CheckpointFile.of(checkpoint)
+        self.path = Path(self.file.path)
+        said = f"{call}(checkpoint={str(self.path)!r})"
+        if self.path.exists() and not self.path.is_dir():
+            raise CheckpointError(
+                f"{said}: several series are saved in a folder, one file for each, and this is a file; give "
+                "the path of a folder"
+            )
+        try:
+            self.path.mkdir(exist_ok=True)
+        except OSError as error:
+            raise CheckpointError(
+                f"{said}: the folder cannot be made: {error.strerror or error}"
+            ) from error
+
+        #: what a file that is here says of the run; empty where there is none
+        self.header: Mapping[str, Any] = {}
+        first = next(self.path.glob("series*.nc"), None)
+        if first is not None:
+            self.header = header_in(open_image(first))
+
+    @property
+    def engine(self) -> Any:
+        """The engine that the run was told to answer with; None where it was left to choose."""
+        return self.header.get("engine") if self.header.get("named") else None
+
+    @property
+    def seed(self) -> np.random.SeedSequence | None:
+        """That of the run; None where none has begun."""
+        return parent(self.header["seed"]) if "seed" in self.header else None
+
+
+def seed_of(folder: Folder | None, rng: Any) -> np.random.SeedSequence:
+    """The seed of all series: the one that is given, or that of the folder, or a new one."""
+    found = folder.seed if folder is not None and rng is None else None
+    return seed_sequence(rng) if found is None else found
+
+
 def several(
     call: str,
     answer: Answer,
@@ -40,6 +98,7 @@ def several(
     options: dict[str, Any],
     progress: bool | None,
     executor: Any,
+    folder: Folder | None = None,
 ) -> list[SeriesPosterior]:
     """The answers about some series, in their order; None in place of those that Ctrl-C left out."""
     problems = _posed(call, dbn, observations, inputs)
@@ -49,7 +108,7 @@ def several(
     units = [(k, problems[k : k + size]) for k in range(0, len(problems), size)]
     shared = {
         "first": problems[0] if problems else None, "answer": answer, "engine": engine, "seed": seed,
-        "options": options,
+        "options": options, "folder": None if folder is None else folder.file,
     }  # fmt: skip
     results = completed(
         _series_answered, shared, units, executor,
@@ -67,12 +126,21 @@ def _series_answered(
 ) -> list[SeriesPosterior]:
     found = []
     for k, problem in enumerate(unit[1], unit[0]):
-        seed = child(shared["seed"], k)
+        seed, options = child(shared["seed"], k), shared["options"]
+        if shared["folder"] is not None:
+            options = {**options, "checkpoint": _in_folder(shared["folder"], k)}
         try:
-            found.append(shared["answer"](problem, shared["engine"], seed, shared["options"]))
+            answer = shared["answer"](problem, shared["engine"], seed, options)
         except BayesmcError as error:
             raise _in_series(error, k) from None
+        if answer.steps < problem.series.steps:  # Ctrl-C cut it short: left out, as those to come
+            raise KeyboardInterrupt
+        found.append(answer)
     return found
+
+
+def _in_folder(folder: CheckpointFile, k: int) -> PartFile:
+    return PartFile.belonging(folder, Path(folder.path) / f"series{k}.nc")
 
 
 def _posed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from typing import Any
 
 from bayesmc.auto.along import along_trajectories
@@ -69,7 +70,9 @@ def infer(
     checkpoint : path or CheckpointFile, optional
         A file in which the run saves itself as it goes on (the extra ``netcdf``). The same call goes on where
         the run was, whatever happened to the process, and ends with the same bits as one that was never
-        stopped; once it has ended, the call returns the answer that is in the file.
+        stopped; once it has ended, the call returns the answer that is in the file. Groups of chains save
+        themselves each in a file of its own beside it, as long as the run goes on: ``run.g0.nc``, ... beside
+        ``run.nc``.
     executor : concurrent.futures.Executor, optional
         Who works out units of work (chunks of draws, groups of chains): processes, threads, Dask, MPI. The
         same seed gives the same bits with any, and with none; engines whose work is one unit run here.
@@ -253,10 +256,11 @@ def _run_saved(
     file, answer = opened.begin(engine, seed, keep, {})
     if file is None:
         return answer
-    if engine.saves:
-        return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file, **spread)
-    found = engine.run(opened.problem, seed, keep, progress, None, **spread)
-    file.finish(found)
+    with closing(file):
+        if engine.saves:
+            return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file, **spread)
+        found = engine.run(opened.problem, seed, keep, progress, None, **spread)
+        file.finish(found)
     return found
 
 

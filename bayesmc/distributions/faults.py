@@ -92,12 +92,19 @@ def missing(owner: Any, what: str) -> NotImplementedError:
 
 
 def check_form(family: type) -> None:
-    """Raise where the ``log_density`` that a class is given cannot be called as a family's is.
+    """Raise where what a class is given would not be called, or not as a family's ``log_density`` is.
 
     Raises
     ------
     TypeError
     """
+    for asked, own in (("log_prob", "_log_prob"), ("sample", "_sample")):
+        if (
+            asked in family.__dict__
+        ):  # engines have ways round it, so it would count here and not there
+            raise TypeError(
+                f"{family.__name__}.{asked} checks its arguments and calls {own}: define {own} instead"
+            )
     form = family.__dict__.get("log_density")
     if form is None:
         return

@@ -54,10 +54,15 @@ def kept_names(keep: Any, problem: Problem) -> tuple[tuple[str, ...], bool, bool
     """
     free = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
     if isinstance(keep, str):
-        return free, keep == "summaries", keep == "file"
+        return free, keep == "summaries", in_file(keep)
     if isinstance(keep, Mapping):
         return tuple(keep["file"]), False, True
     return tuple(keep), False, False
+
+
+def in_file(keep: Any) -> bool:
+    """Whether draws stay in the file of a run."""
+    return keep == "file" or isinstance(keep, Mapping)
 
 
 class Engine:

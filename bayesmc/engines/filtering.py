@@ -89,6 +89,8 @@ class FilterEngine:
     belief: ClassVar[type] = object
     takes_queries: ClassVar[bool] = True
     spreads: ClassVar[bool] = False  #: whether ``filter`` takes an ``executor``
+    #: whether ``filter`` takes ``checkpoint=`` and saves itself as it goes on; others are saved at the end
+    saves: ClassVar[bool] = False
     #: whether its answers are the model's, up to rounding
     is_exact: ClassVar[bool] = False
 

@@ -21,6 +21,7 @@ from scipy import special
 from bayesmc.gaussian import try_cholesky
 
 _LOG_2PI = float(np.log(2.0 * np.pi))
+_ROOT, _HALF = float(np.sqrt(2.0 / np.pi)), float(np.sqrt(0.5))
 
 
 class Tilt(NamedTuple):
@@ -134,6 +135,42 @@ def probit(sign: np.ndarray, offset: np.ndarray, gain: np.ndarray, precision: np
     if not (precision > 0).all():
         log = np.where(precision > 0, log, np.nan)
     return Tilt(log, (mean + pull)[..., None], spread[..., None, None])
+
+
+def probit_messages(
+    shift: np.ndarray, slope: np.ndarray, precision: np.ndarray, linear: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What the moments of the normal cdf of ``shift + slope u`` leave when the cavity is divided out again.
+
+    Precisions and linear terms, of proper cavities, from derivatives of the log integral by the cavity's
+    mean, without the moments between. What over- or underflows warns as NumPy is told to.
+
+    Parameters
+    ----------
+    shift, slope, precision, linear : ndarray, shape (*lead)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.factors.tilted import probit, probit_messages
+    >>> one = np.ones(())
+    >>> precision, linear = probit_messages(0 * one, one, one, 0 * one)
+    >>> whole = probit(one, 0 * one, one, one, 0 * one)
+    >>> bool(np.isclose(1.0 / (one + precision), whole.cov[0, 0]))
+    True
+    >>> bool(np.isclose(linear / (one + precision), whole.mean[0]))
+    True
+    """
+    var = 1.0 / precision
+    mean = var * linear
+    over = 1.0 / np.sqrt(1.0 + slope * slope * var)
+    z = (shift + slope * mean) * over
+    pull = slope * over
+    ratio = _ROOT / special.erfcx(-_HALF * z)
+    towards = pull * ratio
+    curve = pull * towards * (z + ratio)
+    own = curve / (1.0 - var * curve)
+    return own, own * mean + towards * (1.0 + var * own)
 
 
 def mixed(log: np.ndarray, mean: np.ndarray, cov: np.ndarray) -> Tilt:

@@ -57,6 +57,8 @@ class RunFile(Saver):
         CheckpointError
             There is no room for it; all blocks are left as they are.
         """
+        if lazily is not None:
+            _take_in(answer, lazily)
         _write(answer, self.path, {"kind": ANSWER, "of": RUN}, lazily, self.header)
         self.finished = True
         if lazily is not None:
@@ -106,6 +108,19 @@ def _write(
         if isinstance(error, (FileNotFoundError, IsADirectoryError, PermissionError)):
             raise CheckpointError(f"{path}: {error}") from error
         raise refused(path, error) from error
+
+
+def _take_in(answer: Any, lazily: Mapping[str, Any]) -> None:
+    """Hold what cannot be left in the file: draws that stand there in another form than they are kept in."""
+    places = _elsewhere(answer, lazily)
+    for name, lazy in lazily.items():
+        stored = answer._stored.get(name)
+        if isinstance(lazy, Lazy) and stored is not None and id(stored) not in places:
+            whole = np.empty(lazy.shape, lazy.dtype)
+            for where, piece in lazy.pieces():
+                whole[where] = piece
+            whole.flags.writeable = False
+            answer._stored[name] = whole
 
 
 def groups_of(

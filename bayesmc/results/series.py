@@ -55,7 +55,8 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     start : int
         The slice that the first entry belongs to.
     log_marginal_likelihood : float or ndarray
-        Log density of all rows; one for each element of the plates that are filtered separately.
+        Log density of all rows; one for each element of the plates that are filtered separately. Given static
+        nodes that are known, whose own densities are not part of it (of ``infer`` on a template they are).
     log_marginal_increments : ndarray, shape (time,) or (time, *plates)
         Log density of each row given those before; they add up to the above.
     log_marginal_likelihood_mcse : float, ndarray or None

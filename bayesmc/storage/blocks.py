@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bayesmc.errors import CheckpointError, DamagedFileError
-from bayesmc.storage.image import open_image, replacing, set_end
+from bayesmc.storage.image import open_image, set_end
+from bayesmc.storage.replacing import replacing
 
 try:
     import fcntl
@@ -56,7 +57,9 @@ class Blocks:
     repair : bool
         Take the blocks that are whole of a file that is damaged.
     alone : bool
-        Let no other process add blocks, as long as this object lives.
+        Let no other process add blocks, as long as this object lives or until it is closed.
+    named : path, optional
+        What the user gave as ``checkpoint=``, if not this path.
 
     Raises
     ------
@@ -64,8 +67,15 @@ class Blocks:
         The file is cut off, or a block is not what was written; ``blocks`` says how many are whole.
     """
 
-    def __init__(self, path: str | Path, repair: bool = False, alone: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        repair: bool = False,
+        alone: bool = False,
+        named: Any = None,
+    ) -> None:
         self.path = Path(path)
+        self._named = str(path if named is None else named)
         self._lock = Lock(self.path) if alone else None
         self.image = open_image(path)
         self._end = self.image.end
@@ -93,6 +103,10 @@ class Blocks:
         with open(self.path, "rb") as file:
             file.seek(block.at + SIZE)
             return file.read(block.length)
+
+    def close(self) -> None:
+        """Let other processes add blocks."""
+        self._lock = None
 
     def append(self, rows: Sequence[Any] | None, state: Sequence[Any]) -> None:
         """Add rows and the state that follows them: both are there from then on, or neither.
@@ -162,7 +176,7 @@ class Blocks:
         if not count:
             return "None of its blocks is whole; move it away and call again"
         whole = "One of its blocks is whole" if count == 1 else f"{count} of its blocks are whole"
-        again = f"bmc.CheckpointFile({str(self.path)!r}, repair=True)"
+        again = f"bmc.CheckpointFile({self._named!r}, repair=True)"
         return f"{whole}; to go on from the last of them, give checkpoint={again}"
 
     def _tidy(self) -> None:

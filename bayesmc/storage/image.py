@@ -2,15 +2,13 @@
 
 NetCDF is HDF5 with names for axes: ``xarray.open_datatree(path)`` and ArviZ read it. Ours has one group
 besides (``bayesmc``), which holds what was saved as packed bytes, and says how far the blocks behind it
-reach.
+reach. Those numbers change as blocks come; everything else in an image has a checksum.
 """
 
 from __future__ import annotations
 
-import contextlib
-import glob
 import os
-import tempfile
+import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,9 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.errors import DamagedFileError, FileFormatError, missing_extra
+from bayesmc.storage.replacing import Patient, replacing
 
 #: of the layout of files; one that is newer is refused
-VERSION = 1
+VERSION = 2
 #: the group that is ours, what is packed in it, and where blocks end
 GROUP, PACKED, END = "bayesmc", "packed", "end"
 
@@ -88,6 +87,7 @@ def write_image(
     groups: Mapping[str, Group],
     packed: Sequence[Any],
     attributes: Mapping[str, Any],
+    anew: bool = False,
 ) -> None:
     """Write a file whole, and put it in the place of any that is there: readers see the one or the other.
 
@@ -100,23 +100,27 @@ def write_image(
         Parts of what ``storage.packed`` made.
     attributes : dict
         Of our group: numbers and text.
+    anew : bool
+        Where none is there, only: of two processes that write, one comes first.
 
     Raises
     ------
     MissingExtraError
         Without h5netcdf (the extra ``netcdf``).
+    FileExistsError
+        One is there that should not be.
     OSError
         The disk is full, or may not be written; what was there is left as it is.
     """
     path = Path(path)
     h5py, h5netcdf = libraries()
-    with replacing(path) as new, _Patient(new) as raw_file:
+    with replacing(path, anew) as new, Patient(new) as raw_file:
         with h5netcdf.File(raw_file, "w") as file:
             for name, group in groups.items():
                 _write_group(h5py, file.create_group(name), group)
             ours = file.create_group(GROUP)
             size = sum(len(part) for part in packed)
-            ours.dimensions = {"byte": size, "reach": 2}
+            ours.dimensions = {"byte": size, "reach": 3}
             ours.attrs.update({"format": VERSION, **attributes})
             held = ours.create_variable(PACKED, ("byte",), np.uint8)._h5ds
             at = 0
@@ -133,6 +137,7 @@ def write_image(
             size = os.fstat(raw.fileno()).st_size
             set_end(raw.fileno(), where, size)
             set_end(raw.fileno(), where + 8, size)
+            set_end(raw.fileno(), where + 16, _checksum(new, size, where))
 
 
 def open_image(path: str | Path) -> Image:
@@ -143,12 +148,12 @@ def open_image(path: str | Path) -> Image:
     FileNotFoundError
     MissingExtraError
     DamagedFileError
-        It is cut off.
+        It is cut off, or its bytes have changed.
     FileFormatError
         It is no file of ours, or of a version to come.
     """
     h5py, _ = libraries()
-    with _opened(h5py, path) as file:
+    with _opened(h5py, path) as file, _whole(path):
         if GROUP not in file or PACKED not in file[GROUP]:
             raise FileFormatError(
                 f"{path}: a file of this kind, but not one that bayesmc wrote; open it with xarray or ArviZ"
@@ -161,9 +166,11 @@ def open_image(path: str | Path) -> Image:
                 f"{VERSION}); read it with that version"
             )
         held = ours[END]
-        size, end = (int(n) for n in held[...])
-        where = int(held.id.get_offset()) + 8
-        return Image(ours[PACKED][...].tobytes(), attributes, size, end, where)
+        size, end, *checksum = (int(n) for n in held[...])
+        where = int(held.id.get_offset())
+        if checksum and checksum[0] != _checksum(path, size, where):
+            raise _changed(path, f"the first {size} bytes are not those that were written")
+        return Image(ours[PACKED][...].tobytes(), attributes, size, end, where + 8)
 
 
 def is_ours(path: str | Path) -> bool:
@@ -218,41 +225,6 @@ def libraries() -> tuple[Any, Any]:
     return h5py, h5netcdf
 
 
-@contextmanager
-def replacing(path: Path) -> Iterator[str]:
-    """The name of a new file, which takes the place of another one once all of it is on the disk."""
-    try:
-        handle, new = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".new", dir=path.parent)
-    except FileNotFoundError:
-        raise FileNotFoundError(f"{path}: there is no folder {path.parent}") from None
-    os.close(handle)
-    try:
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(new, 0o666 & ~mask)
-        yield new
-        with open(new, "rb") as file:
-            os.fsync(file.fileno())
-        os.replace(new, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(new)
-        raise
-    with contextlib.suppress(OSError):  # not every system lets folders be opened
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-
-def clear_leftovers(path: Path) -> None:
-    """Remove what processes that were killed left of files that were to take the place of this one."""
-    for left in path.parent.glob(f".{glob.escape(path.name)}.*.new"):
-        with contextlib.suppress(OSError):
-            left.unlink()
-
-
 def set_end(handle: int, where: int, end: int) -> None:
     """Say how far a file reaches: eight bytes, which are there whole or not at all."""
     os.lseek(handle, where, os.SEEK_SET)
@@ -260,83 +232,6 @@ def set_end(handle: int, where: int, end: int) -> None:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-class _Patient:
-    """A file that takes all that is written, and says in the end what went wrong.
-
-    HDF5 does not survive a disk that is full: it fails again and again as it closes its file, and may take
-    the process with it.
-    """
-
-    def __init__(self, path: str) -> None:
-        self._file = open(path, "r+b", buffering=0)  # noqa: SIM115 - closed on the way out
-        self._error: OSError | None = None
-        self._size = self._at = 0
-
-    def settle(self) -> None:
-        """Raise what went wrong.
-
-        Raises
-        ------
-        OSError
-        """
-        if self._error is not None:
-            raise self._error
-
-    def __enter__(self) -> _Patient:
-        return self
-
-    def __exit__(self, kind: Any, error: Any, trace: Any) -> None:
-        self._file.close()
-        if self._error is not None and error is not self._error:
-            raise self._error
-
-    def write(self, data: Any) -> int:
-        view = memoryview(data).cast("B")
-        try:
-            at = self._at
-            while self._error is None and at < self._at + len(view):
-                self._file.seek(at)
-                at += self._file.write(view[at - self._at :]) or 0
-        except OSError as error:
-            self._error = error
-        self._at += len(view)
-        self._size = max(self._size, self._at)
-        return len(view)
-
-    def readinto(self, buffer: Any) -> int:
-        view = memoryview(buffer).cast("B")
-        self._file.seek(self._at)
-        count = self._file.readinto(view) or 0
-        view[count:] = bytes(len(view) - count)
-        self._at += len(view)
-        return len(view)
-
-    def read(self, count: int) -> bytes:
-        data = bytearray(count)
-        self.readinto(data)
-        return bytes(data)
-
-    def seek(self, offset: int, whence: int = 0) -> int:
-        self._at = offset + (0, self._at, self._size)[whence]
-        return self._at
-
-    def tell(self) -> int:
-        return self._at
-
-    def truncate(self, size: int | None = None) -> int:
-        size = self._at if size is None else size
-        try:
-            if self._error is None:
-                self._file.truncate(size)
-        except OSError as error:
-            self._error = error
-        self._size = size
-        return size
-
-    def flush(self) -> None:
-        """There is nothing that waits."""
 
 
 @contextmanager
@@ -349,6 +244,37 @@ def _opened(h5py: Any, path: str | Path) -> Iterator[Any]:
         raise _unreadable(path, error) from error
     with file:
         yield file
+
+
+@contextmanager
+def _whole(path: str | Path) -> Iterator[None]:
+    """Where bytes have changed HDF5 fails as it happens to."""
+    try:
+        yield
+    except (DamagedFileError, FileFormatError):
+        raise
+    except Exception as error:
+        raise _changed(path, f"what HDF5 reads in it makes no sense ({error})") from error
+
+
+def _changed(path: str | Path, why: str) -> DamagedFileError:
+    return DamagedFileError(
+        f"{path}: {why}; nothing of it can be trusted; move it away and call again", 0
+    )
+
+
+def _checksum(path: str | Path, size: int, where: int) -> int:
+    """Of so many bytes, but for the three numbers that stand there."""
+    found, at = 0, 0
+    with open(path, "rb") as file:
+        while at < size:
+            piece = bytearray(file.read(min(size - at, 1 << 24)))
+            if not piece:
+                return -1  # it is cut off, or that is not its size
+            low, high = max(where - at, 0), max(where + 24 - at, 0)
+            piece[low:high] = bytes(len(piece[low:high]))
+            found, at = zlib.crc32(piece, found), at + len(piece)
+    return found
 
 
 def _open_unlocked(h5py: Any, path: str | Path) -> Any:

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesmc.storage.blocks import Blocks
-from bayesmc.storage.image import clear_leftovers
 from bayesmc.storage.packing import packed, unpacked
+from bayesmc.storage.replacing import clear_leftovers
 
 #: time between two blocks, in units of what saving the last one took
 _PATIENCE = 20.0
@@ -61,6 +61,18 @@ class CheckpointFile:
         return given if isinstance(given, cls) else cls(given)
 
 
+@dataclass(frozen=True)
+class PartFile(CheckpointFile):
+    """Where a part of what is asked saves itself; ``given`` is the path for all."""
+
+    given: str | os.PathLike[str] = ""
+
+    @classmethod
+    def belonging(cls, file: CheckpointFile, path: Path) -> PartFile:
+        """One with the options of that for all."""
+        return cls(path, file.every, file.repair, file.path)
+
+
 class Saver:
     """Saves blocks of one run, and hands out what an earlier process saved of it.
 
@@ -74,8 +86,10 @@ class Saver:
     """
 
     def __init__(self, file: CheckpointFile, header: Mapping[str, Any], alone: bool = True) -> None:
-        self.path, self.every, self.header = Path(file.path), float(file.every), header
-        self.blocks = Blocks(self.path, file.repair, alone)
+        self.file, self.header = file, header
+        self.path, self.every = Path(file.path), float(file.every)
+        named = file.given if isinstance(file, PartFile) else file.path
+        self.blocks = Blocks(self.path, file.repair, alone, named)
         if alone:
             clear_leftovers(self.path)
         last = self.blocks.state
@@ -86,6 +100,10 @@ class Saver:
     def rows(self) -> Iterator[Any]:
         """All rows that were saved, block by block."""
         return map(unpacked, self.blocks.rows())
+
+    def close(self) -> None:
+        """Let other processes save there."""
+        self.blocks.close()
 
     def due(self) -> bool:
         """Whether it is time for the next block."""

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import chain
 
 import numpy as np
+import scipy
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError
@@ -29,6 +30,8 @@ _MANY = 100
 _FAR = 30.0
 #: points among which some of positive density are looked for, numbers that these may take, and how many do
 _SEARCHED, _NUMBERS, _FOUND = 8192, 4_000_000, 4
+#: what climbs are told where the density is none
+_LOWEST = 1e300
 #: how far log factors may be off, relative to themselves and to their largest part
 _RTOL = 1e-9
 #: how far those may be that are written for free numbers far out: where probabilities are near 0 or 1 the
@@ -67,7 +70,11 @@ def hold_against_model(
     inside = {t.name for table in tables for t in table.terms}
     names = [t.name for t in terms]
     seen, agreed = [False] * len(terms), [False] * len(plain)
-    points = chain(_points(density), _positive(density, lambda: all(seen) and all(agreed)))
+
+    def is_enough() -> bool:
+        return all(seen) and all(agreed)
+
+    points = chain(_points(density), _positive(density, is_enough), _uphill(density, is_enough))
     for u, values in points:
         found = [np.asarray(v) for v in program({**values, FREE: u})]
         given, written = found[: len(plain)], found[len(plain) :]
@@ -156,6 +163,33 @@ def _positive(
             if _completed(density, row, at):
                 found += 1
                 yield row, at
+
+
+def _uphill(
+    density: UnconstrainedDensity, is_enough: Callable[[], bool]
+) -> Iterator[tuple[np.ndarray, Values]]:
+    """Where climbs of the density end: far from zero, probabilities of what was seen may be none before.
+
+    Probabilities that the model's functions round to 0 have logs in expressions that are written for free
+    numbers far out, and these lead to where they are none too small.
+    """
+    rng = np.random.default_rng(density.size)
+    for k in range(_FOUND):
+        if is_enough():
+            return
+        values = other_values(density, k)
+
+        def lost(u: np.ndarray, values: Values = values) -> tuple[float, np.ndarray]:
+            with np.errstate(all="ignore"):
+                log, slopes = density.with_gradient(u, values)
+            return (-float(log), -slopes) if np.isfinite(log) else (_LOWEST, np.zeros(len(u)))
+
+        start = rng.normal(size=density.size) * (k > 0)
+        end = scipy.optimize.minimize(lost, start, jac=True, method="L-BFGS-B").x
+        for u in (end, end + 0.1 * rng.normal(size=density.size)):
+            at = dict(values)
+            if np.isfinite(u).all() and _completed(density, u, at):
+                yield u, at
 
 
 def _completed(density: UnconstrainedDensity, u: np.ndarray, values: Values) -> bool:

@@ -64,10 +64,7 @@ def completed(
     shared: Mapping[str, Any],
     units: Iterable[Any],
     executor: Any = None,
-    *,
-    label: str = "",
-    total: int | None = None,
-    progress: bool | None = None,
+    **shown: Any,
 ) -> Iterator[tuple[int, Any]]:
     """Numbers of units with their results, as they come.
 
@@ -81,11 +78,9 @@ def completed(
         Taken as there are workers for them, so that there may be no end of it.
     executor : concurrent.futures.Executor, optional
         None: one after the other, here.
-    label : str
-        Beside the progress bar, which counts units.
-    total : int, optional
-        How many there are; None shows no bar.
-    progress : bool, optional
+    shown : label, total, progress
+        Of the bar, which counts units: what stands beside it, how many there are (None, the default, shows
+        none), and whether it is wanted.
 
     Raises
     ------
@@ -96,8 +91,7 @@ def completed(
     Exception
         What a unit raised.
     """
-    options: dict[str, Any] = {"label": label, "total": total, "progress": progress}
-    for number, found in _worked(function, shared, units, executor, **options):
+    for number, found in _worked(function, shared, units, executor, **shown):
         if isinstance(found, _Raised):
             raise found.error
         yield number, found
@@ -108,7 +102,7 @@ def in_order(
     shared: Mapping[str, Any],
     units: Iterable[Any],
     executor: Any = None,
-    **options: Any,
+    **shown: Any,
 ) -> Iterator[Any]:
     """The results of ``completed`` in the order of the units, each as soon as those before are there.
 
@@ -116,7 +110,7 @@ def in_order(
     """
     early: dict[int, Any] = {}
     following = 0
-    results = _worked(function, shared, units, executor, **options)
+    results = _worked(function, shared, units, executor, **shown)
     try:
         for number, found in results:
             early[number] = found
@@ -177,15 +171,13 @@ def _worked(
     function: Work,
     shared: Mapping[str, Any],
     units: Iterable[Any],
-    executor: Any = None,
-    *,
+    executor: Any,
     label: str = "",
     total: int | None = None,
     progress: bool | None = None,
 ) -> Generator[tuple[int, Any], None, None]:
     """Numbers of units with their results, or what they raised, as they come."""
-    shown = False if total is None else progress
-    with Progress(total or 0, label, shown) as bar:
+    with Progress(total or 0, label, False if total is None else progress) as bar:
         if executor is None:
             for number, unit in enumerate(units):
                 yield number, function(shared, unit)

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +15,25 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import CheckpointError, DamagedFileError, UnsupportedError
+from bayesmc.errors import (
+    CheckpointError,
+    DamagedFileError,
+    FileFormatError,
+    UnsupportedError,
+)
 from bayesmc.storage import Saver
 from tests import kills
+from tests.workers.test_units import Elsewhere
 
 pytest.importorskip("h5netcdf", reason="needs the extra netcdf")
 
 CASES = kills.cases(0.05)
+UNITS = (
+    "Gibbs, in groups",
+    "Hamiltonian, in groups, in the file",
+    "several series",
+    "particle filter, late",
+)
 
 
 class Stopped(BaseException):
@@ -53,20 +67,24 @@ def reference(name: str) -> str:
     return kills.bits(CASES[name].run(None))
 
 
-@pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("saves", [2, 4])
+@pytest.mark.parametrize(
+    ("name", "saves"), [(n, k) for n in CASES for k in (2, 4) if k == 4 or n not in UNITS]
+)
 def test_the_same_bits(name: str, saves: int, tmp_path: Path) -> None:
     path, case = tmp_path / "run.nc", CASES[name]
     with pytest.raises(Stopped), stopped_after(saves if name != "weighting" else 1):
         case.run(path)
     assert kills.bits(case.run(path)) == reference(name)
     assert kills.bits(case.run(path)) == reference(name)  # the answer that is in the file
-    assert kills.bits(bmc.load(path)) == reference(name)
-    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]
+    each = sorted(path.iterdir()) if path.is_dir() else None
+    loaded = bmc.load(path) if each is None else [bmc.load(own) for own in each]
+    assert kills.bits(loaded) == reference(name)
+    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]  # what groups kept is in it
 
 
-def test_a_fault_in_the_state_shows(tmp_path: Path) -> None:
-    path, case = tmp_path / "run.nc", CASES["Gibbs"]
+@pytest.mark.parametrize("name", ["Gibbs", "Gibbs, in groups", "particle filter, late"])
+def test_a_fault_in_the_state_shows(name: str, tmp_path: Path) -> None:
+    path, case = tmp_path / "run.nc", CASES[name]
     with pytest.raises(Stopped), stopped_after(9):
         case.run(path)
     with pytest.MonkeyPatch.context() as patch:  # random numbers that begin anew
@@ -78,7 +96,128 @@ def test_a_fault_in_the_state_shows(tmp_path: Path) -> None:
                 self.state["generator"]["state"]["state"][0] += 1
 
         patch.setattr(Saver, "__init__", forgetful)
-        assert kills.bits(case.run(path)) != reference("Gibbs")
+        assert kills.bits(case.run(path)) != reference(name)
+
+
+@pytest.fixture
+def workers() -> Iterator[Any]:
+    with ThreadPoolExecutor(2) as pool:
+        yield pool
+
+
+@pytest.mark.parametrize(("name", "saves"), [("Gibbs, in groups", 65), ("several series", 45)])
+def test_units_of_workers_go_on(name: str, saves: int, workers: Any, tmp_path: Path) -> None:
+    path, case = tmp_path / "run.nc", CASES[name]
+    with pytest.raises(Stopped), stopped_after(saves):  # in the second unit
+        case.run(path)
+    left = {p.name for p in kills.files(path)}
+    assert len(left) > 1  # of the run itself, or of another series
+    case = replace(case, options={"executor": workers})
+    assert kills.bits(case.run(path)) == reference(name)
+    assert kills.bits(case.run(path)) == reference(name)
+
+
+class Losing(Elsewhere):
+    """Loses the first worker after it has saved so many blocks."""
+
+    def __init__(self, saves: int) -> None:
+        super().__init__()
+        self.saves = saves
+
+    def submit(self, fn: Any, /, *args: Any, **options: Any) -> Future[Any]:
+        if self.sent:
+            return super().submit(fn, *args, **options)
+        self.sent += 1
+        found: Future[Any] = Future()
+        with pytest.raises(Stopped), stopped_after(self.saves):
+            fn(*args, **options)
+        found.set_exception(ConnectionError("the worker is gone"))
+        return found
+
+
+@pytest.mark.parametrize("name", ["Gibbs, in groups", "several series"])
+def test_a_lost_unit_goes_on_from_its_file(name: str, tmp_path: Path) -> None:
+    pytest.importorskip("cloudpickle", reason="units travel by cloudpickle: bayesmc[workers]")
+    counts = []
+    for k, executor in enumerate((Elsewhere(), Losing(25))):
+        (tmp_path / str(k)).mkdir()
+        saved, plain = [], Saver.save
+
+        def save(
+            self: Saver, rows: Any, state: Any, saved: Any = saved, plain: Any = plain
+        ) -> None:
+            saved.append(self.path)
+            plain(self, rows, state)
+
+        case = replace(CASES[name], options={"executor": executor})
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Saver, "save", save)
+            assert kills.bits(case.run(tmp_path / str(k) / "run.nc")) == reference(name)
+        counts.append(len(saved))
+    assert counts[0] > 50 and counts[1] <= counts[0] + 1  # and not 25 blocks more
+
+
+def test_groups_so_far(tmp_path: Path) -> None:
+    path, case = tmp_path / "run.nc", CASES["Gibbs, in groups"]
+    with pytest.raises(Stopped), stopped_after(65):  # in the second group
+        case.run(path)
+    assert {p.name for p in tmp_path.iterdir()} == {"run.nc", "run.g0.nc", "run.g1.nc"}
+    found, first = bmc.load(path), bmc.load(tmp_path / "run.g0.nc")
+    whole = case.run(path)
+    chains, draws = found["mean"].shape[:2]
+    np.testing.assert_array_equal(found["mean"], whole["mean"][:chains, :draws])
+    np.testing.assert_array_equal(first["mean"], whole["mean"][:2])
+
+
+def test_a_file_of_another_group_is_refused(tmp_path: Path) -> None:
+    path, case = tmp_path / "run.nc", CASES["Gibbs, in groups"]
+    with pytest.raises(Stopped), stopped_after(5):
+        case.run(path)
+    path.unlink()  # the run is begun anew, and its groups are still there
+    with pytest.raises(CheckpointError, match=r"run\.g0\.nc.*seed \(rng=\) was 7 and is 8"):
+        bmc.infer(*case.make(), engine=case.engine, rng=8, checkpoint=path)
+    group = tmp_path / "run.g0.nc"
+    group.write_bytes(group.read_bytes()[:-100])
+    path.unlink()
+    with pytest.raises(DamagedFileError, match=r"CheckpointFile\('.*run\.nc', repair=True"):
+        case.run(path)
+
+
+def test_a_folder_of_series(tmp_path: Path) -> None:
+    folder, case = tmp_path / "runs", CASES["several series"]
+    dbn, series = case.make()
+    found = bmc.filter(dbn, series, engine=case.engine, rng=7, checkpoint=folder)
+    assert kills.bits(found) == reference("several series")
+    (folder / "series1.nc").unlink()
+    again = bmc.filter(
+        dbn, series, checkpoint=folder
+    )  # engine and seed are those of the other file
+    assert kills.bits(again) == reference("several series")
+    with pytest.raises(CheckpointError, match="series 1: .*the observations of 'y' is another"):
+        bmc.filter(dbn, [series[0], {"y": series[1]["y"] + 1}], checkpoint=folder)
+    for wrong, series_, words in (
+        (folder / "series0.nc", series, "give the path of a folder"),
+        (folder, series[0], "give the path of a file"),
+        (tmp_path / "nowhere" / "runs", series, "the folder cannot be made"),
+    ):
+        with pytest.raises(CheckpointError, match=words):
+            bmc.filter(dbn, series_, checkpoint=wrong)
+    with pytest.raises(FileFormatError, match="that is a folder"):
+        bmc.load(folder)
+
+
+def test_states_that_are_not_even_stay_right(tmp_path: Path) -> None:
+    made = bmc.BayesNet()
+    made.add("k", bmc.Categorical([0.2, 0.3, 0.5]), states=(1, 2, 5))
+    made.add("y", lambda k: bmc.Normal(k, 2.0))
+    asked = {"engine": bmc.Gibbs(30, warmup=5, chains=2, groups=2), "rng": 0}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plain = bmc.infer(made, {"y": 3.0}, **asked)
+        path = tmp_path / "run.nc"
+        found = bmc.infer(made, {"y": 3.0}, keep="file", checkpoint=path, **asked)
+    np.testing.assert_array_equal(found["k"], plain["k"])
+    np.testing.assert_array_equal(bmc.load(path)["k"], plain["k"])
 
 
 def net(scale: float = 1.0, plate: int = 3) -> bmc.BayesNet:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -177,15 +178,39 @@ def test_one_net_is_used_by_many_threads_at_once() -> None:
     net.add("y", lambda a, s: bmc.Normal(a, s**-0.5), plates="i")
     data = {"y": np.linspace(-1.0, 1.0, 600)}
     discrete = chain()
+    walk = bmc.DynamicBayesNet()
+    walk.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    walk.add("y", lambda x: bmc.Normal(x, 1.0))
+    rows = {"y": np.linspace(-1.0, 1.0, 12)}
+    particles, kalman = bmc.ParticleFilter(50), bmc.KalmanFilter()
 
     def ask(k: int) -> list[Any]:
         weighted = bmc.infer(net, data, engine=bmc.LikelihoodWeighting(300), rng=k)
         chains = bmc.infer(net, data, engine=bmc.Gibbs(6, 3, 2), rng=k, keep="summaries")
         exact = bmc.infer(discrete, {"slip": LABELS[k % 2]})
-        return [weighted.mean("a"), chains.mean("a"), exact.probabilities("rain").tolist()]
+        filtered = bmc.filter(walk, rows, engine=particles, rng=k)
+        online = particles.start(walk, rng=k)
+        for y in rows["y"]:
+            online = particles.step(online, {"y": y})
+        found = [
+            weighted.mean("a"),
+            chains.mean("a"),
+            exact.probabilities("rain"),
+            filtered.mean("x"),
+        ]
+        found += [online.mean("x"), bmc.filter(walk, rows, engine=kalman).var("x")]
+        found += [net.sample(4, rng=k)["y"], net.log_prob({"a": 0.1 * k, "s": 1.0, **data})]
+        return [np.asarray(value).tolist() for value in found]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("warnings.warn", lambda *arguments, **options: None)
-        with ThreadPoolExecutor(8) as pool:  # the first questions ever: they compile side by side
-            together = list(pool.map(ask, range(16)))
+        often = sys.getswitchinterval()
+        sys.setswitchinterval(1e-6)  # threads take turns wherever they can
+        try:
+            with ThreadPoolExecutor(
+                8
+            ) as pool:  # the first questions ever: they compile side by side
+                together = list(pool.map(ask, range(16)))
+        finally:
+            sys.setswitchinterval(often)
         assert together == [ask(k) for k in range(16)]

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import special
 from scipy.special import i0e
 
 import bayesmc as bmc
@@ -391,3 +392,19 @@ def test_a_template_is_unrolled_and_plain_answers_of_other_engines_are_not_check
         exact.check()
     with pytest.raises(TypeError, match="LaplaceApproximation"):
         bmc.filter(dbn, {"y": [0.3]}, engine=LAPLACE)
+
+
+@pytest.mark.parametrize(
+    ("link", "scale", "far"),
+    [(special.ndtr, 10.0, 60.0), (lambda x: 1.0 / (1.0 + np.exp(-x)), 100.0, 1000.0)],
+    ids=["probit", "logit"],
+)
+def test_an_optimum_far_from_zero_is_found(link: Any, scale: float, far: float) -> None:
+    """The model's own probabilities round to 0 at every point near the prior's middle."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, scale))
+    net.add("y", lambda a: bmc.Bernoulli(link(a - far)))
+    posterior = bmc.infer(net, {"y": 1}, engine=bmc.LaplaceApproximation())
+    wide = np.hypot(scale, 1.0 if link is special.ndtr else np.pi / np.sqrt(3.0))
+    assert abs(posterior.log_marginal_likelihood - special.log_ndtr(-far / wide)) < 3.0
+    assert far - 3.0 < posterior.mean("a") < far + 6.0

@@ -17,8 +17,8 @@ import pytest
 from scipy import optimize, special
 
 import bayesmc as bmc
-from bayesmc.engines.approximate.check import log_joint
 from bayesmc.engines.approximate.stored import completed
+from bayesmc.engines.approximate.weights import log_joint
 from bayesmc.engines.variational.ascent import BoundError, check_bound
 from bayesmc.errors import (
     ConvergenceWarning,

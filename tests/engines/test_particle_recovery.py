@@ -292,7 +292,7 @@ def test_options_travel_without_functions() -> None:
     found = bmc.filter(walk(), ROWS, engine=engine, rng=0)
     again = pickle.loads(pickle.dumps(found))
     np.testing.assert_array_equal(again.anew, found.anew)
-    with pytest.raises(bmc.errors.UnsupportedError, match="unpickled"):
+    with pytest.raises(bmc.errors.UnsupportedError, match="hold no functions"):
         bmc.filter(walk(), ROWS, engine=again.engine)
     adapted = bmc.ParticleFilter(100, adapt=bmc.KLD({"x": 0.5}))
     assert pickle.loads(pickle.dumps(adapted)).adapt.widths == {"x": 0.5}

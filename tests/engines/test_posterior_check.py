@@ -13,8 +13,8 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.engines.approximate.approximation import Drawn
-from bayesmc.engines.approximate.check import pareto_smoothed
 from bayesmc.engines.approximate.posterior import ApproximatePosterior
+from bayesmc.engines.approximate.weights import pareto_smoothed
 from bayesmc.errors import LowEssWarning, UnsupportedError
 from bayesmc.network import pose
 from bayesmc.randomness import seed_sequence
@@ -108,6 +108,39 @@ def test_corrected_answers_of_a_rate(concentration: float, count: int, trusted: 
         assert abs(share - 0.1) < 4 * error
         error = check.log_marginal_likelihood_mcse
         assert abs(check.log_marginal_likelihood - evidence) < 4 * error
+
+
+def grouped() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """A mixture with a label known, shares, a vector, and a number between bounds: every kind of part."""
+    net = bmc.BayesNet(plates={"k": 2, "i": 6})
+    net.add("w", bmc.Dirichlet([2.0, 1.0]))
+    net.add("p", bmc.Beta(2.0, 3.0))
+    net.add("tau", bmc.Gamma(3.0, 2.0), plates="k")
+    net.add("m", lambda tau: bmc.Normal(0.0, 4.0 / np.sqrt(tau)), plates="k")
+    net.add("v", bmc.MvNormal(np.zeros(2), np.eye(2)))
+    net.add("z", lambda w: bmc.Categorical(w), plates="i")
+    net.add("x", lambda z, m, tau: bmc.Normal(m[z], tau[z] ** -0.5), plates="i")
+    net.add("heads", lambda p: bmc.Binomial(9, p))
+    net.add("far", lambda v: bmc.Normal(v[..., 0] - v[..., 1], 0.5))
+    labels = np.ma.masked_array([0] * 5 + [1], [True] * 5 + [False])
+    return net, {"x": [-2.0, -1.5, np.nan, 1.0, 2.0, 1.7], "heads": 4, "far": 1.0, "z": labels}
+
+
+@pytest.mark.parametrize(
+    "engine", [LAPLACE, bmc.MeanField(restarts=1), bmc.ExpectationPropagation()], ids=repr
+)
+def test_values_from_elsewhere_are_weighed_as_draws_are(engine: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is drawn is weighed, settled or not
+        found = [bmc.infer(*grouped(), engine=engine, rng=0).approximation]
+        net, evidence = logistic(20)
+        found.append(bmc.infer(net, evidence, engine=engine, rng=0).approximation)
+    for approximation in found:
+        drawn = (getattr(approximation, "spread", None) or approximation.draw)(
+            np.random.default_rng(1), 100
+        )
+        again = approximation.log_density(drawn.values)
+        np.testing.assert_allclose(again, drawn.log_density, rtol=1e-6, atol=1e-6)
 
 
 # ---- an approximation of one's own ------------------------------------------------------------------

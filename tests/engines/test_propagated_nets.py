@@ -438,7 +438,8 @@ def test_labels_switch_families_of_their_own() -> None:
         off = np.abs(posterior.mean(name) - long.mean(name)) / long.std(name)
         assert off.max() < 0.2
         assert posterior.std(name) == pytest.approx(long.std(name), rel=0.15)
-    one = bmc.infer(net, {"y": y}, engine=bmc.AssumedDensity())
+    with pytest.warns(ConvergenceWarning, match="nothing was said of 'weights'"):
+        one = bmc.infer(net, {"y": y}, engine=bmc.AssumedDensity())
     assert np.abs(one.mean("rate") - posterior.mean("rate")).max() > 1e-3
     back = pickle.loads(pickle.dumps(posterior))
     assert (back.mean("rate") == posterior.mean("rate")).all()

@@ -275,3 +275,31 @@ def test_a_particle_engine_starts_its_static_nodes() -> None:
     engine = bmc.ParticleMetropolis(1, 0, 2, 20, start={"s": [40.0, 50.0]})
     posterior = bmc.infer(dbn, {"y": [0.2, 2.9, 0.4]}, engine=engine, rng=0)
     assert (posterior["s"] > 10.0).all()  # 7 standard deviations of the prior
+
+
+# ---- labels of which some are known -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_scaled", [False, True])
+def test_known_labels_say_which_component_is_which(is_scaled: bool) -> None:
+    """Two of each are known among a hundred; chains that start the other way round stay so."""
+    rng = np.random.default_rng(0)
+    labels = np.arange(100) % 2
+    rows = rng.normal(np.where(labels == 1, 4.0, -4.0), 1.0)
+    net = bmc.BayesNet(plates={"i": 100, "k": 2})
+    net.add("share", bmc.Beta(1.0, 1.0))
+    net.add("scale", bmc.HalfNormal(2.0) if is_scaled else bmc.LogNormal(0.0, 0.01))
+    net.add("mean", bmc.Normal(0.0, 10.0), plates="k")
+    net.add("label", lambda share: bmc.Bernoulli(share), plates="i")
+    net.add("y", lambda label, mean, scale: bmc.Normal(mean[label], scale), plates="i")
+    seen = {"y": rows, "label": np.ma.masked_array(labels, np.arange(100) >= 4)}
+    with marking_invalid(), np.errstate(all="ignore"):
+        target = target_of(pose(net, seen))
+        values = start_states(target, 64, np.random.default_rng(1))
+    right = values["mean"][:, 0] < values["mean"][:, 1]
+    assert right.mean() > 0.9  # a coin's 64 throws are so once in 10^11
+    assert (values["label"][:, :4] == labels[:4]).all()
+    agreed = (values["label"] == labels)[right].mean()
+    assert agreed > 0.8  # and those that are missing follow
+    posterior = bmc.infer(net, seen, engine=bmc.Gibbs(60, 40, 4), rng=2)
+    assert (posterior["mean"].mean(axis=-2)[..., 0] < 0.0).all()

@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from bayesmc.factors.families import GammaFamily, Shares
 from bayesmc.factors.quadrature import along_line, importance, on_lattice
-from bayesmc.factors.tilted import gaussians, log_integral, mixed, probit
+from bayesmc.factors.tilted import gaussians, log_integral, mixed, probit, probit_messages
 
 ONE = np.ones(1)
 
@@ -31,6 +31,19 @@ def test_truncations_are_those_of_scipy(low: float, high: float) -> None:
     )
     assert found.log[0] - 0.5 * np.log(2 * np.pi) == pytest.approx(mass, abs=1e-7)
     assert found.error < 1e-3
+
+
+def test_messages_of_probits_are_what_their_moments_leave() -> None:
+    rng = np.random.default_rng(0)
+    sign, gain = rng.choice([-1.0, 1.0], 2_000), rng.choice([1.0, 0.0, -0.5], 2_000)
+    offset, precision = 2.0 * rng.normal(size=2_000), np.exp(3.0 * rng.normal(size=2_000))
+    linear = 3.0 * rng.normal(size=2_000) * np.sqrt(precision)
+    whole = probit(sign, offset, gain, precision, linear)
+    own, along = probit_messages(sign * offset, sign * gain, precision, linear)
+    var, mean = whole.cov[:, 0, 0], whole.mean[:, 0]
+    assert np.abs(var * (precision + own) - 1.0).max() < 1e-8
+    assert (np.abs(var * (linear + along) - mean) / np.sqrt(var)).max() < 1e-8
+    assert (own[gain == 0.0] == 0.0).all()
 
 
 def test_probit_by_quadrature_is_the_closed_form() -> None:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from scipy import special
 
 import bayesmc as bmc
 from bayesmc.errors import LowEssWarning
@@ -100,9 +101,59 @@ def told_apart(seed: int) -> Verdict:
     return repeated_test(estimate, {"k": np.array(1.0)}, replications=2, alpha=ALPHA, rng=seed)
 
 
+#: counts whose rate changed once
+COUNTS = np.array([1, 0, 1, 1, 0, 1, 1, 1, 1, 0, 0, 4])
+
+
+def changed() -> bmc.BayesNet:
+    """A change point with a rate before it and one after."""
+    net = bmc.BayesNet(plates={"t": len(COUNTS)})
+    net.add("last", bmc.DiscreteUniform(0, len(COUNTS) - 1))
+    for name in ("before", "after"):
+        net.add(name, bmc.Gamma(1.0, 0.5))
+    first = np.arange(len(COUNTS))
+    net.add(
+        "y",
+        lambda last, before, after: bmc.Poisson(np.where(first <= last, before, after)),
+        plates="t",
+    )
+    return net
+
+
+def of_changed() -> dict[str, np.ndarray]:
+    """The exact answer: rates are summed out for every place of the change."""
+    total, before = [], []
+    for last in range(len(COUNTS)):
+        parts = COUNTS[: last + 1], COUNTS[last + 1 :]
+        shapes = [(1.0 + part.sum(), 0.5 + len(part)) for part in parts]
+        total.append(sum(np.log(0.5) + special.gammaln(a) - a * np.log(b) for a, b in shapes))
+        before.append(shapes[0][0] / shapes[0][1])
+    log = np.array(total) - special.gammaln(COUNTS + 1.0).sum() - np.log(len(COUNTS))
+    evidence = special.logsumexp(log)
+    share = np.exp(log - evidence)
+    return {"evidence": evidence, "last": share @ np.arange(len(COUNTS)), "before": share @ before}
+
+
+def elsewhere(seed: int) -> Verdict:
+    """What a check makes of a product that misses changes with other rates."""
+    engine = bmc.MeanField(restarts=2)
+    posterior = bmc.infer(changed(), {"y": COUNTS}, engine=engine, rng=seed)
+
+    def estimate(rng: np.random.Generator) -> dict[str, Any]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LowEssWarning)
+            check = posterior.check(4000, rng=rng)
+        found = check.posterior
+        evidence = check.log_marginal_likelihood
+        return {"evidence": evidence, **{n: found.mean(n) for n in ("last", "before")}}
+
+    return repeated_test(estimate, of_changed(), replications=30, alpha=ALPHA, rng=seed)
+
+
 EXACT = "compare on a linear-Gaussian net (no draws)"
 BOUNDED = "repeated_test of a log-normal posterior (no draws)"
 CHECK = "compare of corrected answers (4,000 draws)"
+ELSEWHERE = "repeated_test of a change point, corrected (30 checks of 4,000 draws)"
 
 MUTANTS = [
     Mutant(
@@ -141,7 +192,7 @@ MUTANTS = [
     ),
     Mutant(
         "weights of a check forget what draws are drawn from",
-        (Edit(f"{AT}check:_weighed", "log_target - drawn.log_density", "log_target"),),
+        (Edit(f"{AT}weights:defended", "target - np.logaddexp", "target - 0.0 * np.logaddexp"),),
         corrected(4000),
         CHECK,
     ),
@@ -162,5 +213,17 @@ MUTANTS = [
         (Edit(f"{AT}free_gaussian:FreeGaussian.spread", "_log_t(z)) - np.log(2.0)", "_log_t(z))"),),
         corrected(4000),
         CHECK,
+    ),
+    Mutant(
+        "draws of the prior do not stand beside those of an approximation",
+        (Edit(f"{AT}check:checked", "found = defended(posterior, batch, besides)", "pass"),),
+        elsewhere,
+        ELSEWHERE,
+    ),
+    Mutant(
+        "draws of the prior are weighed as if the approximation had made them",
+        (Edit(f"{AT}weights:defended", "np.log(share) + prior)", "np.log(share) - 99.0)"),),
+        elsewhere,
+        ELSEWHERE,
     ),
 ]  # fmt: skip

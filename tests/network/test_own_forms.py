@@ -152,3 +152,9 @@ def test_what_is_missing_is_named() -> None:
         Empty().sample(rng=0)
     with pytest.raises(NotImplementedError, match=r"Empty has no log_density\(x, \*\*parameters\)"):
         Empty().log_prob(0.0)
+
+
+@pytest.mark.parametrize("asked", ["log_prob", "sample"])
+def test_what_checks_arguments_is_not_to_be_defined_anew(asked):
+    with pytest.raises(TypeError, match=rf"define _{asked} instead"):
+        type("Scaled", (bmc.Normal,), {asked: lambda self, x: 0.0})

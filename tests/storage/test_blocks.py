@@ -10,7 +10,18 @@ import numpy as np
 import pytest
 
 from bayesmc.errors import CheckpointError, DamagedFileError, FileFormatError
-from bayesmc.storage import Blocks, CheckpointFile, Saver, blocks, packed, write_image
+from bayesmc.storage import (
+    Blocks,
+    CheckpointFile,
+    Group,
+    Saver,
+    Variable,
+    blocks,
+    open_image,
+    packed,
+    unpacked,
+    write_image,
+)
 
 pytest.importorskip("h5netcdf", reason="needs the extra netcdf")
 
@@ -96,3 +107,30 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         Blocks(tmp_path / "nowhere.nc")
     assert os.listdir(tmp_path) == ["notes.txt"]
+
+
+def test_every_changed_byte_of_an_image_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "answer.nc"
+    group = Group({"x": Variable(("draw",), np.arange(50.0))})
+    write_image(path, {"posterior": group}, packed({"x": np.arange(20)}), {"kind": "answer"})
+    whole = path.read_bytes()
+    image = open_image(path)
+    assert image.attributes["kind"] == "answer"
+    reach = range(image.end_at, image.end_at + 8)  # of which blocks are a check
+    rng = np.random.default_rng(0)
+    for at in rng.choice(len(whole), 150, replace=False):
+        changed = bytearray(whole)
+        changed[at] ^= 1 << rng.integers(8)
+        path.write_bytes(changed)
+        if at not in reach:
+            with pytest.raises((DamagedFileError, FileFormatError)):
+                open_image(path)
+
+
+def test_of_two_that_begin_a_file_one_comes_first(tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    write_image(path, {}, packed({"header": "one"}), {"kind": "run"}, anew=True)
+    with pytest.raises(FileExistsError):
+        write_image(path, {}, packed({"header": "other"}), {"kind": "run"}, anew=True)
+    assert unpacked(open_image(path).packed)["header"] == "one"
+    assert [p.name for p in tmp_path.iterdir()] == ["run.nc"]

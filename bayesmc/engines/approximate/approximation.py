@@ -63,6 +63,10 @@ class Approximation(Protocol):
     It may have a method ``spread(rng, draws) -> Drawn`` besides: draws about the same centre with heavier
     tails, with the log density of what they are drawn from. ``check`` corrects by these, since weights of a
     density with light tails do not show what lies beyond them; without, by the approximation's own draws.
+
+    And it may have a method ``log_density(values) -> ndarray`` of shape ``(draws,)``: the log density of what
+    ``spread`` draws from (``draw`` without it) at values that came from elsewhere, as ``Drawn`` has them.
+    With it ``check`` draws from the prior, too, whose weights show regions that the approximation misses.
     """
 
     @property

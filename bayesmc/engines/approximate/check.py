@@ -3,8 +3,9 @@
 Draws of the approximation q are weighed by p/q, with p the model's own functions (not what an engine read of
 them, so that faults of reading show, too). The largest weights are replaced by quantiles of a generalised
 Pareto distribution that is fitted to them, whose shape k says whether averages of the weights can be trusted.
-Corrected answers come from draws with heavier tails, where the approximation has some: what lies beyond the
-tails of q none of its own draws has met, and their weights cannot tell.
+Corrected answers come from draws with heavier tails, where the approximation has some, and from some of the
+prior (``defensive``): what lies beyond the tails of q, or elsewhere, none of its own draws has met, and their
+weights cannot tell.
 
 References
 ----------
@@ -19,28 +20,26 @@ from __future__ import annotations
 import warnings
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from bayesmc.categorical import log_sum_exp
-from bayesmc.diagnostics import MAX_PARETO_K, pareto_k
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.approximate.approximation import Approximation, Drawn
-from bayesmc.engines.approximate.evidence import log_constants
-from bayesmc.engines.approximate.rare import log_of
-from bayesmc.engines.approximate.stored import as_stored, completed
-from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
-from bayesmc.network import Problem
+from bayesmc.diagnostics import MAX_PARETO_K
+from bayesmc.engines.approximate.approximation import Approximation
+from bayesmc.engines.approximate.defensive import SHARE, prior_draws
+from bayesmc.engines.approximate.weights import (
+    EQUAL,
+    FINITE,
+    CheckedPosterior,
+    defended,
+    evaluated,
+    weighed,
+)
+from bayesmc.errors import LowEssWarning
 from bayesmc.results import DrawsPosterior, Posterior
-from bayesmc.structure.target import target_of
 
 #: draws of which a tail can be told at all
 _FEWEST = 25
-#: differences of log weights that are rounding
-_EQUAL = 1e-7
-#: below this shape weights have a variance
-_FINITE = 0.5
 #: share of a standard deviation up to which answers are near
 _NEAR = 0.15
 #: root of how many draws in a rare state tell its deviation to a part of that
@@ -65,17 +64,6 @@ class _Row(NamedTuple):
     moved: float
 
 
-class CheckedPosterior(DrawsPosterior):
-    """Draws of an approximation, weighed so that they answer for the posterior."""
-
-    k: float = np.nan
-
-    @property
-    def pareto_k(self) -> float | None:  # type: ignore[override]
-        """Tail shape of the weights as they were before their tail was smoothed."""
-        return self.k
-
-
 @dataclass(frozen=True, eq=False)
 class Check:
     """What ``posterior.check`` found; it prints as a summary.
@@ -93,7 +81,9 @@ class Check:
     moved : float
         How far the mean that is farthest off moved when it was corrected, in standard deviations.
     posterior : Posterior
-        Corrected answers: the draws with smoothed weights, and Monte Carlo errors that count these.
+        Corrected answers: draws with smoothed weights, and Monte Carlo errors that count these. Beside the
+        approximation's own there are a quarter as many of the prior, unless all its weights are equal and
+        none of these exceeds them.
     log_marginal_likelihood, log_marginal_likelihood_mcse : float
         The corrected log evidence, and its error.
     approximate, approximation : Posterior, Approximation
@@ -134,13 +124,17 @@ class Check:
         words = "right within their errors"
         if not own < self.bound:
             words = "not to be trusted, either: ask HamiltonianMonteCarlo() or Gibbs()"
+        besides, unseen = "", "the approximation never reaches"
+        if self.posterior.of_prior:
+            besides = f" and {self.posterior.of_prior} of the prior"
+            unseen = "the approximation and these never reach"
         lines = [
-            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws, weighed in the nodes' "
-            f"own coordinates (made in {self.approximation.coordinates})",
+            f"Check of {type(self.approximate.engine).__name__} by {self.draws} draws{besides}, weighed in "
+            f"the nodes' own coordinates (made in {self.approximation.coordinates})",
             f"Pareto k {self.k:.2f} (bound {self.bound:.2f}): plain answers are {self._plain_words()}",
             f"corrected ones, by draws with k {own:.2f} worth {ess:.0f}, are {words}",
-            "neither k nor the errors tell of regions that the approximation never reaches: other modes, "
-            "states with numbers far off",
+            f"neither k nor the errors tell of regions that {unseen}: other modes, states with numbers far "
+            "off",
         ]
         plain = self.approximate.log_marginal_likelihood
         if plain is not None:
@@ -165,7 +159,7 @@ class Check:
         if not self.ok:
             return "not to be trusted" if self._is_settled else "of a run that did not settle"
         off = max(self.moved, max((abs(row.wider) for row in self._rows), default=0.0))
-        return "near" if self.k < 0.5 and off < _NEAR else "off by what is printed"
+        return "near" if self.k < FINITE and off < _NEAR else "off by what is printed"
 
     @cached_property
     def _rows(self) -> list[_Row]:
@@ -178,7 +172,8 @@ class Check:
             # of what draws answer, the same draws without weights, unless these have heavier tails
             own = self.approximation
             closed = own.marginal(name) is not None or own.probabilities(name) is not None
-            is_plain = closed or getattr(own, "spread", None) is not None
+            others = getattr(own, "spread", None) is not None or self.posterior.of_prior
+            is_plain = closed or others
             before_weights = self.approximate if is_plain else self._unweighted
             plain, found = (p.mean(name).ravel() for p in (before_weights, self.posterior))
             before, after = (p.std(name).ravel() for p in (before_weights, self.posterior))
@@ -186,8 +181,8 @@ class Check:
             least = self._least_deviation(name)
             one, two = np.maximum(before, least), np.maximum(after, least)
             with np.errstate(all="ignore"):
-                certain = np.where(np.abs(found - plain) > _EQUAL, np.inf, 0.0)
-                moved = np.where(two > _EQUAL * one, (found - plain) / two, certain)
+                certain = np.where(np.abs(found - plain) > EQUAL, np.inf, 0.0)
+                moved = np.where(two > EQUAL * one, (found - plain) / two, certain)
                 one, two = (np.maximum(sd, _COUNTED * least) for sd in (before, after))
                 wider = np.where(one > 0, two / one - 1.0, 0.0)
             labels = self.posterior._row_names(node)
@@ -242,116 +237,35 @@ def checked(
         raise ValueError(
             f"check(draws={draws!r}): draws is a whole number, {_FEWEST} or more, such as 4000"
         )
-    own = _weighed(posterior, approximation, approximation.draw(rng, int(draws)), rng)
+    batch = evaluated(posterior, approximation, approximation.draw(rng, int(draws)), rng)
+    own = weighed(posterior, batch, batch.ratio)
     spread, found = getattr(approximation, "spread", None), own
     # equal weights say that it is exact, unless it has left states out that no draw meets
-    if spread is not None and (own.k > -np.inf or hasattr(approximation, "tied")):
-        found = _weighed(posterior, approximation, spread(rng, int(draws)), rng)
-    k = max(
-        own.k, found.k
-    )  # mass that the approximation's own draws never meet shows in wider ones
+    exact = own.k == -np.inf and not (spread is not None and hasattr(approximation, "tied"))
+    if spread is not None and not exact:
+        batch = evaluated(posterior, approximation, spread(rng, int(draws)), rng)
+        found = weighed(posterior, batch, batch.ratio)
+    others = prior_draws(posterior._live("check"), approximation, _others(int(draws)), rng)
+    if others is not None:
+        besides = evaluated(posterior, approximation, others, rng)
+        # what is drawn from with heavier tails has half the approximation's own density at least
+        slack = np.log(2.0) if spread is not None else 0.0
+        if not (exact and besides.ratio.max() < batch.ratio.max() + slack + EQUAL):
+            found = defended(posterior, batch, besides)
+    # mass that the approximation's own draws never meet shows in others
+    k = max(own.k, found.k)
     result = Check(k, _bound(int(draws)), found, posterior, approximation, int(draws))
     if not k < result.bound:
         warnings.warn(_doubt(result), LowEssWarning, stacklevel=3)
     return result
 
 
-def log_joint(problem: Problem, names: Any, values: Any, draws: int) -> np.ndarray:
-    """The model's log density of the evidence and of nodes' values, what is drawn forward left out.
-
-    Parameters
-    ----------
-    names : tuple of str
-        The nodes of the approximation.
-    values : dict
-        Stored values of all nodes, shape ``(draws, *plates, *event)``.
-
-    Returns
-    -------
-    ndarray, shape (draws,)
-    """
-    target = target_of(problem, names)
-    outside = set(target.chain) - set(names)
-    if outside:
-        raise UnsupportedError(
-            f"check: the approximation says nothing of node {min(outside)!r}, on which something observed "
-            "depends"
-        )
-    with marking_invalid(), np.errstate(all="ignore"):
-        found = np.broadcast_to(target.log_density(values, log_of=log_of), (draws,))
-    return found + log_constants(target)
-
-
-def pareto_smoothed(log_weights: np.ndarray) -> tuple[np.ndarray, float]:
-    """Log weights with their largest replaced by quantiles of a generalised Pareto law, and its shape k.
-
-    Weights that are equal to rounding are left as they are, with k minus infinity. The fit takes weights that
-    come in lumps (of finite states), or one that stands out among next to equal ones, for a heavy tail. Of
-    weights with that tail the largest of S carries about S^(k - 1) of their sum (Chatterjee and Diaconis 2018
-    judge by that share); where it carries less than 1/sqrt(S), as it does of those with a variance, weights
-    are left as they are, and k is the shape of so small a largest one.
-    """
-    from arviz_stats.base import array_stats
-
-    possible = log_weights > -np.inf
-    low, top = log_weights[possible].min(), log_weights[possible].max()
-    if possible.all() and top - low < _EQUAL:
-        return log_weights.copy(), -np.inf
-    k = pareto_k(log_weights[possible], log_weights.size)
-    largest = _shape_of_largest(log_weights)
-    if largest < _FINITE <= k:  # a lump of weights, as of finite states, and no tail
-        return log_weights.copy(), largest
-    bottom = max(low, top - 600.0)  # what is farther below is nothing, and stays so
-    filled = np.where(possible, np.maximum(log_weights, bottom), bottom - 50.0)
-    try:
-        with np.errstate(all="ignore"), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            found = np.asarray(array_stats.psislw(-filled)[0])
-    except ValueError:  # there is no tail: its weights are equal
-        return log_weights.copy(), k
-    at = int(filled.argmin())
-    found = found + (filled[at] - found[at])  # as they were before they were made to sum to 1
-    if not np.isfinite(found).all():
-        return log_weights.copy(), k
-    return np.where(possible, found, -np.inf), k
-
-
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _weighed(
-    posterior: Posterior, approximation: Approximation, drawn: Drawn, rng: np.random.Generator
-) -> CheckedPosterior:
-    """Draws with the model's density over their own as weights."""
-    problem, draws = posterior._live("check"), len(drawn.log_density)
-    values = completed(problem, approximation.names, drawn, rng)
-    log_target = log_joint(problem, approximation.names, values, draws)
-    with np.errstate(invalid="ignore"):
-        raw = log_target - drawn.log_density
-    raw = np.where(np.isnan(raw), -np.inf, raw)
-    if not (raw > -np.inf).any():
-        raise ZeroProbabilityError(
-            f"check: the model gives none of {draws} draws of the approximation a positive density; ask a "
-            "sampling engine"
-        )
-    smoothed, k = pareto_smoothed(raw)
-    stored = as_stored(problem, values)
-    found = CheckedPosterior(
-        problem, posterior.engine, stored, (1, draws), smoothed[None], independent=True
-    )
-    found.k = k
-    total = float(log_sum_exp(smoothed[None]))
-    found.log_marginal_likelihood = total - float(np.log(draws))
-    ess = found.weight_ess
-    assert ess is not None
-    found.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
-    return found
-
-
-def _shape_of_largest(log_weights: np.ndarray) -> float:
-    """The shape of a tail whose largest weight carries the share of all that this one does."""
-    share = log_weights.max() - float(log_sum_exp(log_weights[None]))
-    return float(1.0 + share / np.log(log_weights.size))
+def _others(draws: int) -> int:
+    """Draws of the prior beside so many others."""
+    return max(round(draws * SHARE / (1.0 - SHARE)), 1)
 
 
 def _doubt(check: Check) -> str:

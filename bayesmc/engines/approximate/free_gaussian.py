@@ -25,6 +25,7 @@ from bayesmc.passes.affine import affine
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.free_nodes import FreeNode
 from bayesmc.structure.summed_states import drawn_states
+from bayesmc.structure.target import Values
 
 #: points of the integral along a line, in standard deviations from the middle on either side
 _POINTS, _REACH = 801, 9.0
@@ -146,6 +147,18 @@ class FreeGaussian:
         wide = np.sqrt(_DEGREES / rng.chisquare(_DEGREES, draws))
         z *= np.where(rng.random(draws) < 0.5, wide, 1.0)[:, None]
         return self._placed(z, np.logaddexp(_log_normal(z), _log_t(z)) - np.log(2.0), rng)
+
+    def log_density(self, values: Values) -> np.ndarray:
+        """The log density of what ``spread`` draws from, at given values, shape (draws,)."""
+        assert self.density is not None
+        with np.errstate(all="ignore"):
+            u = self.density.unconstrain(values)
+            away = u - self.center
+            turned = np.mod(away + np.pi, 2.0 * np.pi) - np.pi
+            z = np.where(self.density.angles, turned, away) @ self.root
+            log = np.logaddexp(_log_normal(z), _log_t(z)) - np.log(2.0)
+            log = log + np.log(np.diag(self.root)).sum() - self.density.log_volume(u)
+        return log + drawn_states(self.density, u, None, values)[1]
 
     def _placed(self, z: np.ndarray, log: np.ndarray, rng: np.random.Generator) -> Drawn:
         """Draws in standard coordinates, with their log density there, as draws of nodes."""

@@ -22,7 +22,14 @@ from bayesmc.engines.mcmc.convergence import (
     warn_of_ties,
 )
 from bayesmc.engines.mcmc.given import frozen_start, read_start
-from bayesmc.engines.mcmc.groups import GROUPS, check_groups, groups_of, run_groups, state_of
+from bayesmc.engines.mcmc.groups import (
+    GROUPS,
+    check_groups,
+    groups_of,
+    groups_so_far,
+    in_groups,
+    state_of,
+)
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
@@ -171,15 +178,11 @@ class ChainEngine(Engine):
         checkpoint: RunFile | None = None,
     ) -> Posterior:
         many = self.draws is not None and (self.chains or LEAST) >= 2 * LEAST
-        if self.groups is not None or (many and checkpoint is None):
+        if self.groups is not None or many:
             groups = groups_of(self, problem)
-            if groups > 1 and checkpoint is not None:
-                raise UnsupportedError(
-                    f"{type(self).__name__}(groups={groups}): runs in groups are not saved; leave "
-                    "checkpoint= or groups= away"
-                )
             if groups > 1:
-                return self._in_groups(problem, seed, keep, progress, resume, executor, groups)
+                own = executor, groups, checkpoint
+                return in_groups(self, problem, seed, keep, progress, resume, *own)
         return self._together(problem, seed, keep, progress, resume, checkpoint)
 
     def _together(
@@ -231,38 +234,7 @@ class ChainEngine(Engine):
             lazily = saving.lazily(lengths.chains, held.draws) if spilled else None
             checkpoint.finish(posterior, lazily)
         if not self.silent:
-            self._warn(posterior, sampler, finished, lengths)
-        return posterior
-
-    def _in_groups(
-        self,
-        problem: Problem,
-        seed: np.random.SeedSequence,
-        keep: Any,
-        progress: bool | None,
-        resume: Posterior | None,
-        executor: Any,
-        groups: int,
-    ) -> Posterior:
-        """The same by groups of chains that run apart."""
-        lengths = self.lengths(problem, keep)
-        if resume is not None:
-            summed = isinstance(resume, ChainsSums)
-            kept = resume._running.names if summed else tuple(resume._stored)  # type: ignore[attr-defined]
-            names = kept if isinstance(keep, str) else tuple(keep)
-            lengths = self._refuse_another(resume, problem, names, summed, lengths)
-        ready = replace(self, warmup=lengths.warmup, chains=lengths.chains)  # type: ignore[type-var]
-        tied = self.tied(problem)
-        if tied:
-            warn_of_ties(type(self).__name__, tied)
-        posterior, finished = run_groups(
-            ready, problem, seed, keep, progress, resume, executor, groups
-        )
-        sampler = replace(ready, chains=lengths.chains // groups, groups=1).sampler(problem)  # type: ignore[type-var]
-        object.__setattr__(posterior, "engine", self)
-        self._warn(posterior, sampler, finished, lengths)
-        if not finished:
-            posterior.checkpoint = None
+            self._warn(posterior, sampler, finished, lengths, checkpoint is not None)
         return posterior
 
     def _ready(self, problem: Problem, asked: Lengths, lengths: Lengths, is_new: bool) -> Sampler:
@@ -289,7 +261,7 @@ class ChainEngine(Engine):
 
     def so_far(self, problem: Problem, file: RunFile) -> Posterior | None:
         """What a run has come to that has not ended; None where that is nothing."""
-        return answer_so_far(self, problem, file)
+        return answer_so_far(self, problem, file) or groups_so_far(self, problem, file)
 
     def _drawn(
         self,
@@ -415,6 +387,7 @@ class ChainEngine(Engine):
         sampler: Sampler,
         finished: bool,
         lengths: Lengths,
+        saved: bool,
     ) -> None:
         name = type(self).__name__
         point = {} if posterior.checkpoint is None else posterior.checkpoint.state
@@ -422,6 +395,7 @@ class ChainEngine(Engine):
             chains, draws = posterior._chains_and_draws
             more = "infer(..., resume=posterior) continues them"
             more = "groups that were stopped cannot be continued" if GROUPS in point else more
+            more = "the same call goes on where they are" if saved else more
             made = f"the {draws} draws of each of {chains} chains made so far"
             message = f"{name}: interrupted; the posterior has {made}, and {more}"
             warnings.warn(message, InterruptWarning, stacklevel=5)

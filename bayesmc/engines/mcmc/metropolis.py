@@ -168,7 +168,8 @@ class MetropolisHastings(ChainEngine):
     def _plan(self, problem: Problem) -> Plan:
         if any(spec is None for spec in self._given.values()):
             raise UnsupportedError(
-                "MetropolisHastings: this engine was unpickled, and pickles carry no functions; make it anew"
+                "MetropolisHastings: this engine is a pickle's or a file's, which hold no functions; give it "
+                "anew"
             )
         return plan_of(problem, self._given, self.chains or _CHAINS)
 

@@ -15,6 +15,7 @@ import numpy as np
 from bayesmc.categorical import pick_log
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, in_order, largest_term, row_logs
+from bayesmc.engines.mcmc.labelled import relabelled
 from bayesmc.errors import (
     BayesmcError,
     DensityError,
@@ -32,6 +33,8 @@ from bayesmc.structure.target import Target, Term, Values
 #: how far draws go from the prior mean, for successive attempts
 _SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 0.0)
 _ATTEMPTS = 8
+#: how many times as many where some labels are known
+_LOOKED = 8
 #: power of the likelihood by which one of several attempts is drawn
 _TEMPERED = 0.25
 #: numbers of one node drawn in all attempts, at most, where possible states are rare
@@ -65,8 +68,10 @@ def start_states(
     """
     found = _Search(target, chains, rng, given or {})
     continuous = any(not target.model[n].is_discrete for n in target.chain)
+    # a start that known labels agree with is worth looking for
+    some_labels = any(target.seen(n) and target.model[n].domain for n in target.chain)
     for spread in _SPREADS:
-        found.attempt(spread, _ATTEMPTS)
+        found.attempt(spread, _ATTEMPTS * (_LOOKED if some_labels and spread == 1.0 else 1))
         if found.complete and not continuous:
             break
         if spread == 1.0 and not found.alive:
@@ -139,7 +144,7 @@ class _Search:
         self.attempts += attempts
         given = {n: np.tile(v, (attempts,) + (1,) * (v.ndim - 1)) for n, v in self.given.items()}
         try:
-            values, log = _attempt(
+            values, log, is_told = _attempt(
                 self.target, self.chains * attempts, spread, self.rng, self.culprits, given
             )
         except ParameterError as error:
@@ -149,7 +154,8 @@ class _Search:
         log = np.where(np.isnan(log), -np.inf, log).reshape(attempts, self.chains)
         # a power of the likelihood as weight: starts as wide as the posterior, or wider; but what is to go
         # with a start that the user gave goes with it as well as it can
-        key = log if self.given else _TEMPERED * log + self.rng.gumbel(size=log.shape)
+        power = 1.0 if is_told else _TEMPERED  # few labels are known, and starts are wide anyhow
+        key = log if self.given else power * log + self.rng.gumbel(size=log.shape)
         pick = key.argmax(axis=0), np.arange(self.chains)
         # closer to the prior mean only where that helps a lot: starts ought to differ
         better = log[pick] > self.log + (10.0 if self.best else 0.0)
@@ -280,10 +286,18 @@ def _attempt(
     rng: np.random.Generator,
     culprits: dict[str, int],
     given: Values,
-) -> tuple[Values, np.ndarray]:
-    """Forward draws of the chain's nodes, and the log density of what was seen given them."""
+) -> tuple[Values, np.ndarray, bool]:
+    """Forward draws of the chain's nodes, and the log density of what was seen given them.
+
+    And whether that is of known labels alone, where others are missing.
+    """
     values, undefined = _drawn_all(target, count, spread, rng, given)
-    log = np.zeros(count)
+    log, told = np.zeros(count), set[str]()
+    for name in target.chain:
+        if target.seen(name) is not None and name not in given:
+            found = relabelled(target, name, values, rng)
+            if found is not None:
+                log, told = log + found[1], told | found[0]
     for name, wrong in undefined.items():
         log = np.where(wrong, -np.inf, log)
         if wrong.all():
@@ -293,13 +307,14 @@ def _attempt(
         if term.name in inside and target.seen(term.name) is None and term.name not in given:
             continue
         part = row_logs(term, values, count)
-        log = log + part.sum(axis=tuple(range(1, part.ndim)))
+        part = part.sum(axis=tuple(range(1, part.ndim)))
+        log = np.where(part > -np.inf, log, -np.inf) if term.name in told else log + part
         if not (log > -np.inf).any():
             culprits[term.name] = culprits.get(term.name, 0) + 1
             break
     inside |= set(target.links)
     chosen = {n: v for n, v in values.items() if n in inside}
-    return chosen, log
+    return chosen, log, bool(told)
 
 
 def _drawn_all(

@@ -199,6 +199,7 @@ class ParticleFilter(FilterEngine):
 
     label: ClassVar[str] = "particle filter"
     keeps: ClassVar[bool] = True
+    saves: ClassVar[bool] = True
     belief: ClassVar[type] = ParticleBelief
 
     def __post_init__(self) -> None:

@@ -23,6 +23,7 @@ from bayesmc.engines.particles.enough import warn_of_errors
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.island_answers import IslandRows, answered
 from bayesmc.engines.particles.island_rows import Passed, pass_rows
+from bayesmc.engines.particles.options import check_count, check_number
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import UnsupportedError
@@ -113,16 +114,9 @@ class IslandFilter(FilterEngine):
                 f"{name}(cloud={self.cloud!r}): give the particle filter, "
                 "IslandFilter(ParticleFilter(100_000), islands=8)"
             )
-        whole = isinstance(self.islands, (int, np.integer)) and not isinstance(self.islands, bool)
-        if not whole or self.islands < 1:
-            raise ValueError(
-                f"{name}(islands={self.islands!r}): islands is a whole number, 1 or more"
-            )
-        number = isinstance(self.threshold, (int, float)) and not isinstance(self.threshold, bool)
-        if not number or not 0 <= self.threshold <= 1:
-            raise ValueError(
-                f"{name}(threshold={self.threshold!r}): give a share of the islands, 0 to 1"
-            )
+        check_count("islands", self.islands, "such as 8", name)
+        share = "a share of the islands, 0 to 1"
+        check_number("threshold", self.threshold, (int, float), lambda x: 0 <= x <= 1, share, name)
         count = self.cloud.particles
         if self.islands == 1:
             return

@@ -16,7 +16,9 @@ from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.run import filtered_by
 from bayesmc.engines.particles.smc import Bare, Particles
+from bayesmc.engines.particles.written import Written
 from bayesmc.randomness import Purpose, stream
+from bayesmc.storage import Saver
 
 
 def by_lag(
@@ -28,6 +30,7 @@ def by_lag(
     queries: Queries,
     progress: bool | None,
     kind: str = "fixed-lag",
+    saver: Saver | None = None,
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """Slices by the particles ``lag`` slices later, through ancestors; and the filter's answer.
 
@@ -42,6 +45,7 @@ def by_lag(
 
     is_answer = kind == "filter"
     options: dict[str, Any] = {"look_back": look_back, "names": () if is_answer else None}
+    options |= {"saver": saver, "late": late}
     try:
         whole = filtered_by(engine, step, problem, seed, False, {}, progress, **options)
     except (Exception, KeyboardInterrupt) as stop:
@@ -81,6 +85,23 @@ class _Late:
         while self._window:
             self._say(k, again)
             again = True
+
+    # ---- what is saved of it ---------------------------------------------------------------------
+
+    def written_since(self, slices: int) -> list[Written]:
+        """What is settled of the slices from one on."""
+        return self.record.written_since(slices)
+
+    def unsettled(self) -> dict[str, Any]:
+        """What is yet to change, and the slices that wait."""
+        return {**self.record.unsettled(), "window": list(self._window)}
+
+    def go_on(self, written: list[Written], unsettled: dict[str, Any]) -> None:
+        """Be where another one was."""
+        self.record.go_on(written, unsettled)
+        self._window = deque(unsettled["window"])
+
+    # ---- private -------------------------------------------------------------------------------
 
     def _say(self, k: int, again: bool) -> None:
         """Answer for the first slice that waits; ``again`` by the same particles as the one before."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -42,6 +42,19 @@ def check_count(option: str, given: Any, what: str, call: str = "ParticleFilter"
         )
 
 
+def check_number(
+    option: str,
+    given: Any,
+    kinds: tuple[type, ...],
+    is_good: Callable[[Any], bool],
+    what: str,
+    call: str = "ParticleFilter",
+) -> None:
+    """One number of some kinds."""
+    if isinstance(given, bool) or not isinstance(given, kinds) or not is_good(given):
+        raise ValueError(f"{call}({option}={given!r}): give {what}")
+
+
 def check_numbers(engine: Any) -> None:
     """Options that are one number."""
     whole, real = (int, np.integer), (int, float)
@@ -56,9 +69,7 @@ def check_numbers(engine: Any) -> None:
         ),
         ("ess_threshold", real, lambda x: x >= 0, share),
     ):
-        given = getattr(engine, option)
-        if isinstance(given, bool) or not isinstance(given, kinds) or not is_good(given):
-            raise ValueError(f"ParticleFilter({option}={given!r}): give {what}")
+        check_number(option, getattr(engine, option), kinds, is_good, what)
 
 
 def check_choice(
@@ -288,5 +299,5 @@ def require_functions(engine: Any, options: Collection[str]) -> None:
     whole = engine.recovery is None or engine.recovery.is_whole
     if not whole or any(value is None for value in given):
         raise UnsupportedError(
-            "ParticleFilter: this engine was unpickled, and pickles carry no functions; make it anew"
+            "ParticleFilter: this engine is a pickle's or a file's, which hold no functions; give it anew"
         )

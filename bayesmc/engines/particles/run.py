@@ -14,7 +14,7 @@ from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.made import Ahead
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.record import FilteredParticles, Record
-from bayesmc.engines.particles.saved import SavedFilter
+from bayesmc.engines.particles.saved import Recorded, SavedFilter
 from bayesmc.engines.particles.smc import Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.progress import Progress
@@ -34,11 +34,12 @@ def filtered_by(
     look_back: Callable[[int, Particles, Families], None] | None = None,
     names: Sequence[str] | None = None,
     saver: Saver | None = None,
+    late: Recorded | None = None,
 ) -> FilteredParticles:
     """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
 
     Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows. There are
-    answers about some nodes, or all that are hidden.
+    answers about some nodes, or all that are hidden. What ``late`` keeps is saved, too.
     """
     record = Record(problem, step.layout, queries, keep, Tracker(step), names)
     rng, check = (stream(seed, what, unit) for what in (Purpose.FILTER, Purpose.CHECK))
@@ -46,7 +47,7 @@ def filtered_by(
     now: Particles | None = None
     is_ahead = step.machine is not None and look_back is None
     ahead = Ahead(step.machine, problem, record) if is_ahead else None
-    saved = None if saver is None else SavedFilter(saver, record, looks, rng)
+    saved = None if saver is None else SavedFilter(saver, record, looks, rng, late)
     begun = 0
     if saved is not None:
         begun, now = saved.begin()

@@ -11,7 +11,6 @@ from bayesmc.engines.filtering import Queries
 from bayesmc.engines.particles.compiled_step import is_worth_compiling
 from bayesmc.engines.particles.lags import by_lag
 from bayesmc.engines.particles.record import FilteredParticles
-from bayesmc.errors import UnsupportedError
 from bayesmc.results import RunFile
 
 
@@ -26,8 +25,7 @@ def run_of(
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """The answer, and that of the filter, which is the same unless it comes some rows late."""
     if file is not None:
-        found = _saved(engine, problem, seed, keep, queries, progress, file)
-        return found, found
+        return _saved(engine, problem, seed, keep, queries, progress, file)
     sized = engine._sized(engine._enough(problem, seed, keep, progress))
     if engine.delay is not None:
         return by_lag(sized, problem, seed, engine.delay, keep, queries, progress, "filter")
@@ -46,13 +44,8 @@ def _saved(
     queries: Queries,
     progress: bool | None,
     file: RunFile,
-) -> FilteredParticles:
+) -> tuple[FilteredParticles, FilteredParticles]:
     """A run that saves itself, or goes on, with as many particles and the same code as it was begun with."""
-    if engine.delay is not None:
-        raise UnsupportedError(
-            f"ParticleFilter(delay={engine.delay}): a run whose answers come some rows late is not saved; "
-            "leave checkpoint= out, or delay="
-        )
     if file.state is None:
         sized = engine._sized(engine._enough(problem, seed, keep, progress))
         compiled = engine.compiled
@@ -61,6 +54,10 @@ def _saved(
         file.save(None, {"particles": sized.particles, "compiled": compiled})
         file.state = {"particles": sized.particles, "compiled": compiled}
     sized = engine._sized(file.state["particles"])
-    found: FilteredParticles = sized._passed(problem, seed, keep, queries, progress, saver=file)
+    if engine.delay is None:
+        found = whole = sized._passed(problem, seed, keep, queries, progress, saver=file)
+    else:
+        late = keep, queries, progress, "filter", file
+        found, whole = by_lag(sized, problem, seed, engine.delay, *late)
     file.finish(found)
-    return found
+    return found, whole

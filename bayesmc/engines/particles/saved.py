@@ -43,14 +43,24 @@ class SavedFilter:
         What compares rows with those that were expected.
     rng : Generator
         That of the filter.
+    late : Recorded or None
+        Answers that come some rows late.
     """
 
     def __init__(
-        self, saver: Saver, record: Recorded, looks: Replicates | None, rng: np.random.Generator
+        self,
+        saver: Saver,
+        record: Recorded,
+        looks: Replicates | None,
+        rng: np.random.Generator,
+        late: Recorded | None = None,
     ) -> None:
-        self.saver, self.record, self.looks, self.rng = saver, record, looks, rng
-        #: slices that are saved: that were passed, and of which all is settled
-        self._passed = self._settled = 0
+        self.saver, self.looks, self.rng = saver, looks, rng
+        #: what is kept of the slices, by its name in the file, and of how many all is settled that is saved
+        self.records = {"written": record} | ({} if late is None else {"late": late})
+        self._settled = dict.fromkeys(self.records, 0)
+        #: slices that were passed and are saved
+        self._passed = 0
         #: what was chosen when the run was begun
         self._chosen = {n: v for n, v in (saver.state or {}).items() if n in CHOSEN}
         self._is_tried = False
@@ -60,14 +70,16 @@ class SavedFilter:
         saved = self.saver.state
         if saved is None or "now" not in saved:
             return 0, None
-        written: list[Written] = []
+        written: dict[str, list[Written]] = {what: [] for what in self.records}
         for rows in self.saver.rows():
-            written += rows["written"]
+            for what, pieces in written.items():
+                pieces += rows[what]
             if self.looks is not None:
                 self.looks.put(rows["first"], rows["looks"])
-        self._settled = sum(map(count, written))
         self._passed, self._is_tried = saved["passed"], True
-        self.record.go_on(written, saved["unsettled"])
+        for what, record in self.records.items():
+            self._settled[what] = sum(map(count, written[what]))
+            record.go_on(written[what], saved["unsettled"][what])
         self.rng.bit_generator.state = saved["generator"]
         if self.looks is not None:
             self.looks.go_on(saved["looks"])
@@ -79,12 +91,13 @@ class SavedFilter:
             self._try(now)
         if not self.saver.due():
             return
-        written = self.record.written_since(self._settled)
-        rows: dict[str, Any] = {"first": self._passed, "written": written}
+        settled = {w: r.written_since(self._settled[w]) for w, r in self.records.items()}
+        rows: dict[str, Any] = {"first": self._passed, **settled}
         if self.looks is not None:
             rows["looks"] = self.looks.rows(self._passed, k + 1)
         self.saver.save(rows, self._state(k, now))
-        self._settled += sum(map(count, written))
+        for what, pieces in settled.items():
+            self._settled[what] += sum(map(count, pieces))
         self._passed = k + 1
 
     # ---- private -------------------------------------------------------------------------------
@@ -96,7 +109,7 @@ class SavedFilter:
             "now": now,
             "generator": self.rng.bit_generator.state,
             "looks": None if self.looks is None else self.looks.state,
-            "unsettled": self.record.unsettled(),
+            "unsettled": {what: record.unsettled() for what, record in self.records.items()},
         }
 
     def _try(self, now: Particles | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,6 +18,7 @@ from bayesmc.engines.approximate.approximation import Drawn, Marginal
 from bayesmc.engines.propagation.beliefs import Conjugates, normalised
 from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.system import System
+from bayesmc.factors.families import Shares
 
 #: points of Gauss and Hermite for moments of mapped numbers
 _POINTS = 96
@@ -125,6 +126,37 @@ class Messages:
         values, own, wide = self._drawn(rng, rng.random(draws) < 0.5)
         return Drawn(values, np.logaddexp(own, wide) - np.log(2.0))
 
+    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """The log density of what ``spread`` draws from, at given values, shape (draws,)."""
+        beliefs, draws = self._beliefs, len(values[self.names[0]])
+        free, both = np.zeros((draws, len(beliefs.size))), np.zeros((2, draws))
+        for name, x in self._numbers.items():
+            free[:, x.at[x.at >= 0]] = x.freed(np.asarray(values[name], dtype=float))[:, x.at >= 0]
+        for k, block in enumerate(beliefs.blocks):
+            mine = np.flatnonzero(beliefs.size == k)
+            away = np.zeros((draws, *block.linear.shape))
+            at = beliefs.component[mine], beliefs.place[mine]
+            away[:, *at] = free[:, mine] - beliefs.centre[mine] - block.mean[at]
+            root = np.linalg.cholesky(block.cov)
+            noise = np.linalg.solve(root, away[..., None])[..., 0]
+            size = np.log(root.diagonal(0, -2, -1)).sum()
+            logs = _log_densities((noise**2).sum(axis=-1), noise.shape[-1])
+            both += np.stack([log.sum(axis=-1) for log in logs]) - size
+        for name in self.names:
+            if name in self._numbers:
+                both -= _volume(self._numbers[name], free)
+            elif name in self._kept:
+                event = self.model[name].event_shape
+                value = np.asarray(values[name]).reshape(draws, -1, *event)
+                if not event and isinstance(self._held(name)[0].family, Shares):
+                    value = np.stack([value, 1.0 - value], axis=-1)
+                members = self._both_members(name)
+                both += np.stack([dist.log_prob(value).sum(axis=-1) for dist in members])
+            else:
+                codes = np.asarray(values[name]).reshape(draws, -1).astype(np.intp)
+                both += np.stack([_picked(table, codes) for table in self._both_tables(name)])
+        return np.logaddexp(*both) - np.log(2.0)
+
     def marginal(self, name: str) -> Marginal | None:
         """Of a node by itself; of simplexes and matrices by draws."""
         if name in self._kept:
@@ -213,9 +245,7 @@ class Messages:
                 values[name], size = x.whole(free), _volume(x, free)
                 own, wide = own - size, wide - size
             elif name in self._kept:
-                held, rows = self._held(name)
-                natural = held.naturals[rows]
-                both = [held.family.member(n) for n in (natural, held.family.widened(natural))]
+                both = self._both_members(name)
                 one, two = (dist.sample(rng, (draws,)) for dist in both)
                 drawn = np.where(is_wide.reshape(-1, *(1,) * (one.ndim - 1)), two, one)
                 own, wide = (
@@ -227,17 +257,10 @@ class Messages:
                 values[name] = drawn.reshape(draws, *node.value_shape)
             else:
                 assert node.domain is not None
-                table = normalised(self._logs(name))
-                even = np.logaddexp(table + np.log(1 - _EVEN), np.log(_EVEN / node.domain.size))
-                if name in self._seen:  # what was seen is never drawn anew
-                    even[self._seen[name]] = table[self._seen[name]]
+                table, even = self._both_tables(name)
                 chosen = np.where(is_wide[:, None, None], even, table)
                 codes = (chosen + rng.gumbel(size=(draws, *table.shape))).argmax(axis=-1)
-                own, wide = (
-                    log
-                    + np.take_along_axis(t[None], codes[..., None], axis=-1)[..., 0].sum(axis=-1)
-                    for log, t in ((own, table), (wide, even))
-                )
+                own, wide = own + _picked(table, codes), wide + _picked(even, codes)
                 values[name] = codes.reshape(draws, *node.plate_shape).astype(node.domain.dtype)
         return values, own, wide
 
@@ -294,6 +317,21 @@ class Messages:
         kept = self._kept[name]
         return self._beliefs.families[kept.field], kept.rows
 
+    def _both_members(self, name: str) -> list[Distribution]:
+        """The distribution of a node that keeps its family, and that with heavier tails."""
+        held, rows = self._held(name)
+        natural = held.naturals[rows]
+        return [held.family.member(n) for n in (natural, held.family.widened(natural))]
+
+    def _both_tables(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Log probabilities of the states of all elements, and mixed with even ones."""
+        table, domain = normalised(self._logs(name)), self.model[name].domain
+        assert domain is not None
+        even = np.logaddexp(table + np.log(1 - _EVEN), np.log(_EVEN / domain.size))
+        if name in self._seen:  # what was seen is never drawn anew
+            even[self._seen[name]] = table[self._seen[name]]
+        return table, even
+
     def _logs(self, name: str) -> np.ndarray:
         """Log beliefs of all elements of a finite node."""
         places = [self._places[name, e] for e in range(math.prod(self.model[name].plate_shape))]
@@ -305,6 +343,11 @@ class Messages:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _picked(table: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """Log probabilities of states, (draws, elements), summed over elements."""
+    return np.take_along_axis(table[None], codes[..., None], axis=-1)[..., 0].sum(axis=-1)
 
 
 def _log_densities(square: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:

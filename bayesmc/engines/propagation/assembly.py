@@ -19,7 +19,7 @@ from bayesmc.engines.propagation.coordinates import Numbers
 from bayesmc.engines.propagation.density import Read
 from bayesmc.engines.propagation.kernels import Switched, Tables
 from bayesmc.engines.propagation.lines import LineBatch
-from bayesmc.engines.propagation.scopes import Rows, basis, padded
+from bayesmc.engines.propagation.scopes import Rows, basis, is_one_row, padded
 from bayesmc.engines.propagation.statistics import Kept, Linear, OwnFamilies
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Problem
@@ -169,8 +169,7 @@ class Assembly:
                 yield row.coordinates[None]
         for read in self.reads:
             if read.coordinates.shape[1]:
-                shared = (read.coordinates == read.coordinates[:1]).all()
-                yield read.coordinates[:1] if shared else read.coordinates
+                yield read.coordinates[: 1 if is_one_row(read.coordinates) else None]
 
     def _centre(self, component: np.ndarray) -> None:
         """Count coordinates from where they will end, roughly."""
@@ -302,10 +301,16 @@ class Assembly:
     ) -> list[Batch]:  # fmt: skip
         """Batches of factors in components of one size each."""
         beliefs, found = self.beliefs, []
-        sizes = beliefs.size[coordinates[:, 0]]
+        everyone = np.arange(len(coordinates))
+        shared = is_one_row(coordinates)
+        if shared:
+            sizes = beliefs.size[coordinates[:1, 0]]
+        else:
+            sizes = beliefs.size[coordinates[:, 0]]
         for block in np.unique(sizes):
-            mine = np.flatnonzero(sizes == block)
-            at = coordinates[mine]
+            mine = everyone if shared else np.flatnonzero(sizes == block)
+            at = coordinates[:1] if shared else coordinates[mine]
+            component, places = beliefs.component[at[:, 0]], beliefs.place[at]
             kind = LineBatch if weights.shape[1] == 1 and not edges else Batch
             found.append(
                 kind(
@@ -315,9 +320,9 @@ class Assembly:
                     tuple(Edge(e.group, e.at[mine]) for e in edges),
                     cards,
                     int(block),
-                    beliefs.component[at[:, 0]],
-                    beliefs.place[at],
-                    weights[mine],
+                    np.broadcast_to(component, (len(mine),)),
+                    np.broadcast_to(places, (len(mine), places.shape[1])),
+                    weights if len(mine) == len(weights) else weights[mine],
                     is_prior,
                     elements[mine],
                     mine,

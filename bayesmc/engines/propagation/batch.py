@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs, Blocks, clipped, normalised
+from bayesmc.engines.propagation.scopes import is_one_row
 from bayesmc.factors.tilted import Tilt, inverses, log_integral, log_sum, mixed
 from bayesmc.gaussian import try_cholesky
 
@@ -117,11 +118,8 @@ class Batch:
         self.error = 0.0
         #: integrals of what contradicts the belief; of densities there is no telling
         self.floor = NOTHING if not k else -np.inf
-        self._touched = np.unique(self.component)
-        self.is_shared = self.block >= 0 and bool(
-            (self.component == self.component[:1]).all()
-            and (self.columns == self.columns[:1]).all()
-        )
+        self.is_shared = self.block >= 0 and is_one_row(self.component) and is_one_row(self.columns)
+        self._touched = self.component[:1] if self.is_shared else np.unique(self.component)
         self.everyone = np.arange(self.count)
 
     @property

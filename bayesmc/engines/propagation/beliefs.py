@@ -15,6 +15,7 @@ import scipy
 from bayesmc.factors.families import Family
 from bayesmc.factors.tilted import log_integral, log_sum
 from bayesmc.gaussian import try_cholesky
+from bayesmc.linalg.patterns import lapack
 
 #: log of what is impossible: its exponential is 0, and sums and differences of it stay numbers
 IMPOSSIBLE = -1e3
@@ -69,11 +70,12 @@ class Blocks:
     linear: np.ndarray
     cov: np.ndarray = field(init=False)
     mean: np.ndarray = field(init=False)
+    _right: np.ndarray | None = field(init=False, default=None, repr=False)
 
     def refreshed(self, which: np.ndarray | None = None) -> np.ndarray:
         """Invert anew; components that have no integral keep their moments, and are True in the answer."""
         at = slice(None) if which is None else which
-        if len(self.precision) == 1 and which is not None and self._refreshed_one():
+        if len(self.precision) == 1 and self._refreshed_one():
             return np.zeros(1, dtype=bool)
         root, bad = try_cholesky(self.precision[at])
         if bad is None:
@@ -93,15 +95,18 @@ class Blocks:
 
     def _refreshed_one(self) -> bool:
         """Invert the only component anew, where it is proper."""
-        try:
-            root = np.linalg.cholesky(self.precision[0])
-        except np.linalg.LinAlgError:
+        n = self.linear.shape[1]
+        if self._right is None:
+            self._right = np.eye(n, n + 1, order="F")
+        self._right[:, n] = self.linear[0]
+        _, found, fault = lapack().dposv(self.precision[0], self._right, lower=1)
+        if fault or not np.isfinite(found.sum()):
             return False
-        left = np.linalg.inv(root)
-        if not np.isfinite(left).all():
-            return False
-        np.matmul(left.T, left, out=self.cov[0])
-        np.matmul(left.T, left @ self.linear[0], out=self.mean[0])
+        if not hasattr(self, "cov"):
+            self.cov, self.mean = np.empty_like(self.precision), np.empty_like(self.linear)
+        cov = found[:, :n]
+        np.multiply(0.5, cov + cov.T, out=self.cov[0])
+        self.mean[0] = found[:, n]
         return True
 
     @property

@@ -281,7 +281,7 @@ class Terms:
         if float(len(at)) * states * d * m > _ENTRIES:
             raise BudgetError("ExpectationPropagation: too many coefficients", 8 * _ENTRIES)
         column = ((first if like else where)[..., None] == coordinates[:, None, :]).argmax(axis=-1)
-        coordinates = np.maximum(np.broadcast_to(coordinates, (len(at), m)), 0)
+        coordinates = np.broadcast_to(np.maximum(coordinates, 0), (len(at), m))
         if like and states * d == 1 and (np.bincount(column[0]) <= 1).all():
             full_gain = np.zeros((len(at), m))
             full_gain[:, column[0]] = np.where(first < 0, 0.0, flat)

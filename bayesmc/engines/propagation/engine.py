@@ -181,7 +181,9 @@ class AssumedDensity(MessageEngine):
     the same moments, and never seen again. So the answer depends on the order of declaration (of a plate,
     that of its elements), and is mostly further off than that of ``ExpectationPropagation``, which goes on
     until messages agree. What is linear-Gaussian is entered exactly, at once. Its answers are approximate,
-    and ``posterior.check()`` tells by how much.
+    and ``posterior.check()`` tells by how much. Of a node whose factors are taken in before anything observed
+    has told of the nodes below (the weights of a mixture with unknown components) one pass learns nothing,
+    and a ``ConvergenceWarning`` names it.
 
     Parameters
     ----------
@@ -213,6 +215,13 @@ class AssumedDensity(MessageEngine):
         return pass_once(system)
 
     def doubt(self, end: Settled) -> str | None:
+        if end.untold:
+            return (
+                f"AssumedDensity: nothing was said of {', '.join(map(repr, end.untold[:6]))}: factors that "
+                "read them come, in the order of declaration, before those that observations enter, and are "
+                "not seen again, so that the answers are those of the prior there; take "
+                "ExpectationPropagation"
+            )
         if not end.open:
             return None
         if end.silent:

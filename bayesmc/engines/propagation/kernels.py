@@ -10,13 +10,21 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
 from bayesmc.expression import Program
 from bayesmc.factors.quadrature import along_line, importance, on_lattice
-from bayesmc.factors.tilted import Tilt, gaussians, inverses, log_integral, probit
+from bayesmc.factors.tilted import (
+    Tilt,
+    gaussians,
+    inverses,
+    log_integral,
+    probit,
+    probit_messages,
+)
 
 #: numbers that a density is evaluated for at a time
 _AT_ONCE = 1 << 21
@@ -80,6 +88,14 @@ class Probit:
     how: str = "probit"
     is_log_concave: ClassVar[bool] = True
 
+    @cached_property
+    def shift(self) -> np.ndarray:
+        return self.sign * self.offset
+
+    @cached_property
+    def slope(self) -> np.ndarray:
+        return self.sign * self.gain
+
     def tilted(
         self,
         members: np.ndarray,
@@ -91,6 +107,15 @@ class Probit:
         if len(members) < len(sign):
             sign, offset, gain = (a[members] for a in (sign, offset, gain))
         return probit(sign, offset, gain, precision[:, 0, 0], linear[:, 0])
+
+    def messages(
+        self, members: np.ndarray, precision: np.ndarray, linear: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Precisions and linear terms of messages, given proper cavities, all of shape (f,)."""
+        shift, slope = self.shift, self.slope
+        if len(members) < len(shift):
+            shift, slope = shift[members], slope[members]
+        return probit_messages(shift, slope, precision, linear)
 
 
 @dataclass(frozen=True, eq=False)

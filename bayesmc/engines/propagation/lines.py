@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesmc.engines.propagation.batch import ROUNDING, Batch, Outcome, cautious
 from bayesmc.engines.propagation.beliefs import Beliefs, Blocks
+from bayesmc.factors.tilted import log_integral
 
 
 @dataclass(eq=False)
@@ -33,6 +34,15 @@ class LineBatch(Batch):
         own = 1.0 / var
         precision = own - self.precision[:, 0, 0]
         linear = mean * own - self.linear[:, 0]
+        messages = getattr(self.kernel, "messages", None)
+        if messages is not None and (precision > ROUNDING * own).all():
+            towards, also = messages(self.members, precision, linear)
+            towards -= self.precision[:, 0, 0]
+            also -= self.linear[:, 0]
+            if np.isfinite(towards.sum() + also.sum()):
+                if share < 1.0:
+                    towards, also = share * towards, share * also
+                return Outcome(0 if self._go(blocks, towards, also) else self.count, 0.0)
         precision[np.abs(precision) < ROUNDING * own] = 0.0
         wide = precision[:, None, None], linear[:, None], (mean[:, None], var[:, None, None])
         found = self.kernel.tilted(self.members, *wide)
@@ -52,6 +62,17 @@ class LineBatch(Batch):
         if self._go(blocks, step * change, step * move):
             return Outcome(skipped, found.error)
         return Outcome(skipped + self.count, found.error)
+
+    def constants(self, beliefs: Beliefs) -> np.ndarray:
+        """Logs by which factors exceed their messages, given beliefs as they are."""
+        mean, var = self._along(beliefs.blocks[self.block])
+        own = 1.0 / var
+        total = mean * own
+        precision, linear = own - self.precision[:, 0, 0], total - self.linear[:, 0]
+        precision[np.abs(precision) < ROUNDING * own] = 0.0
+        wide = precision[:, None, None], linear[:, None], (mean[:, None], var[:, None, None])
+        whole = self.kernel.tilted(self.members, *wide).log
+        return whole - log_integral(own[:, None, None], total[:, None])
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -94,6 +115,6 @@ class LineBatch(Batch):
             return
         assert self.turned is not None
         c = self.component[0]
-        added = (self.turned * change) @ self.turned.T
+        added = (self.turned * change) @ self.weights[:, 0]
         blocks.precision[c] += 0.5 * (added + added.T)
         blocks.linear[c] += self.turned @ move

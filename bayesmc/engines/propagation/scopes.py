@@ -80,6 +80,19 @@ def basis(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return directions, rows @ np.matrix_transpose(directions)
 
 
+def is_one_row(rows: np.ndarray) -> bool:
+    """Whether all rows are the same; of rows that are one in memory nothing is compared.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.engines.propagation.scopes import is_one_row
+    >>> is_one_row(np.broadcast_to(np.arange(3), (5, 3))), is_one_row(np.arange(4).reshape(2, 2))
+    (True, False)
+    """
+    return not rows.strides[0] or bool((rows == rows[:1]).all())
+
+
 def padded(parts: Sequence[np.ndarray]) -> np.ndarray:
     """Rows of whole numbers as one array; the first of a row stands where it is short."""
     width = max((len(p) for p in parts), default=0)

@@ -156,9 +156,11 @@ class OwnFamilies:
     def _all_linear(self, priors: dict[str, tuple[f.Family, np.ndarray]]) -> bool:
         """Read all factors of the nodes; those of which one is not linear are left out, for another try."""
         self._lay_out(priors)
+        self.factors = {}
+        if not priors:
+            return True
         statistics = self._statistics()
         terms = Terms(self.model, self.known, statistics, self.finite)  # type: ignore[arg-type]
-        self.factors = {}
         for term in self.target.terms_of(tuple(priors)):
             if term.name in priors and not self._above(term.name, priors):
                 continue

@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.engines.propagation.batch import Batch, cautious
 from bayesmc.engines.propagation.beliefs import NOTHING, Beliefs
+from bayesmc.engines.propagation.conjugate import ConjugateBatch
 from bayesmc.engines.propagation.contradiction import (
     Bounds,
     are_squeezed,
@@ -25,6 +26,7 @@ from bayesmc.engines.propagation.lines import LineBatch
 from bayesmc.engines.propagation.pace import Pace
 from bayesmc.engines.propagation.system import System
 from bayesmc.errors import ZeroProbabilityError
+from bayesmc.structure.target import target_of
 
 #: probabilities below this do not count as changed
 _TINY = 1e-12
@@ -53,6 +55,9 @@ class Settled:
         Of one pass: the sum of the logs of factors' integrals with the belief that each of them met.
     silent : dict
         Node or potential -> number of its factors that were left out to the end and never sent a message.
+    untold : tuple of str
+        Of one pass: nodes of which nothing that reads them said anything, though something observed depends
+        on them.
     """
 
     converged: bool
@@ -65,6 +70,7 @@ class Settled:
     share: float
     log_as_met: float | None = None
     silent: Mapping[str, int] = field(default_factory=dict)
+    untold: tuple[str, ...] = ()
 
 
 def settle(
@@ -86,8 +92,9 @@ def settle(
         return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, pace.share)
     bounds = [b for b in map(bounds_of, batches) if b is not None]
     room = spreads(bounds, beliefs)
+    after = _marginals(beliefs)
     while done < sweeps:
-        before = _marginals(beliefs)
+        before = after
         for batch in batches:
             batch.error = 0.0
         skips = [(batch, _visited(batch, beliefs, pace)) for batch in order]
@@ -130,7 +137,8 @@ def pass_once(system: System) -> Settled:
     total = np.nan if skipped else _evidence(system)
     error = max((b.error for b in system.batches), default=0.0)
     silent = _silent(system.batches) if skipped else {}
-    return Settled(not skipped, 1, 0.0, skipped, skipped, total, error, 1.0, met, silent)
+    untold = _untold(system)
+    return Settled(not skipped, 1, 0.0, skipped, skipped, total, error, 1.0, met, silent, untold)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -147,6 +155,27 @@ def _silent(batches: Sequence[Batch]) -> dict[str, int]:
         if count:
             found[batch.name] = found.get(batch.name, 0) + count
     return found
+
+
+def _untold(system: System) -> tuple[str, ...]:
+    """Nodes whose every message from others is flat: what could tell of them was taken in too late."""
+    names = {place: name for (name, _), place in system.places.items()}
+    heard: dict[str, bool] = {}
+    for batch in system.batches:
+        for edge, table in zip(batch.edges, batch.tables, strict=True):
+            said = np.ptp(table, axis=-1) > _TINY
+            for at, is_said in zip(edge.at.tolist(), said.tolist(), strict=True):
+                name = names[edge.group, at]
+                if name != batch.name:
+                    heard[name] = heard.get(name, False) or is_said
+        if isinstance(batch, ConjugateBatch):
+            for name, kept in system.kept.items():
+                mine = (kept.field == batch.field) & np.isin(batch.at, kept.rows)
+                if name != batch.name and np.any(mine):
+                    said = np.abs(batch.sites[mine]).max() > _TINY
+                    heard[name] = heard.get(name, False) or bool(said)
+    above = target_of(system.target.problem).chain
+    return tuple(name for name in above if not heard.get(name, True))
 
 
 def _visited(batch: Batch, beliefs: Beliefs, pace: Pace) -> int:

@@ -92,8 +92,7 @@ class FreeFactor(Factor):
 
     def start(self, state: State, values: Mapping[str, np.ndarray]) -> None:
         known = {**self.target.known, **values}
-        parts = [node.freed(np.asarray(known[node.name], float), known) for node in self.nodes]
-        self.mean = np.concatenate([p.reshape(-1) for p in parts])
+        self.mean = self.freed(known).reshape(-1)
         scale = 0.1  # of a unit on the free line
         self.root = np.full(self.size, scale) if not self.is_full else scale * np.eye(self.size)
         state[FREE] = self.placed(self.points)
@@ -144,6 +143,11 @@ class FreeFactor(Factor):
         for node in self.nodes:
             above[node.name] = node.constrained(u[..., node.start : node.start + node.size], above)
         return {n: above[n] for n in self.names}
+
+    def freed(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Free numbers of stored values of its nodes and those above, shape ``(*batch, size)``."""
+        parts = [node.freed(np.asarray(values[node.name], float), values) for node in self.nodes]
+        return np.concatenate(parts, axis=-1)
 
     def log_volume(self, u: np.ndarray, known: Mapping[str, np.ndarray]) -> np.ndarray:
         above = {**known, **self.constrained(u, known)}

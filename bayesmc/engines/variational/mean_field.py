@@ -32,7 +32,7 @@ from bayesmc.network import Problem
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import Posterior
-from bayesmc.structure.target import target_of
+from bayesmc.structure.target import Values, target_of
 
 #: bounds below this are of what is impossible
 NEVER = -1e250
@@ -72,6 +72,11 @@ class MeanFieldApproximation:
         if not self.tied:
             return None
         return replace(self, parts=tuple(_evened(part, self.tied) for part in self.parts)).draw
+
+    def log_density(self, values: Values) -> np.ndarray:
+        """Of given values: that of ``spread``, or of ``draw`` where there is none, shape (draws,)."""
+        parts = [_evened(part, self.tied) for part in self.parts]
+        return np.asarray(sum(part.log_density(values) for part in parts))
 
     def part(self, name: str) -> Part | None:
         return next((p for p in self.parts if name in p.names), None)

@@ -45,6 +45,10 @@ class Part(Protocol):
         """Stored values of its nodes, and the log density of each draw."""
         ...
 
+    def log_density(self, values: Values) -> np.ndarray:
+        """The log density of stored values, shape (draws,)."""
+        ...
+
     def marginal(self, name: str) -> Marginal | None: ...
     def moments(self, name: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Means and variances, where quantiles have no closed form."""
@@ -90,6 +94,15 @@ class NormalPart:
         diagonal = np.log(np.linalg.diagonal(root)) * free
         log = -0.5 * (z**2 + _LOG_2PI * free).sum(axis=(1, 2)) - diagonal.sum()
         return {self.names[0]: value}, log
+
+    def log_density(self, values: Values) -> np.ndarray:
+        groups, w = self.cov.shape[:2]
+        free = np.ones((groups, w)) if self.seen is None else (~self.seen).reshape(groups, w) * 1.0
+        root = np.linalg.cholesky(self.cov + (1.0 - free)[:, :, None] * np.eye(w))
+        away = (values[self.names[0]] - self.mean).reshape(-1, groups, w) * free
+        z = np.linalg.solve(root, away[..., None])[..., 0]
+        diagonal = np.log(np.linalg.diagonal(root)) * free
+        return -0.5 * (z**2 + _LOG_2PI * free).sum(axis=(1, 2)) - diagonal.sum()
 
     def marginal(self, name: str) -> Marginal | None:
         var = np.linalg.diagonal(self.cov).reshape(self.mean.shape)
@@ -147,6 +160,20 @@ class ScatterPart:
         each = -0.5 * (z**2 + _LOG_2PI) - np.log(np.linalg.diagonal(root))
         return found, log + each.reshape(draws, -1).sum(axis=1)
 
+    def log_density(self, values: Values) -> np.ndarray:
+        value = values[self.own]
+        with np.errstate(all="ignore"):
+            log = self.known.total(self.distribution.log_prob(value))
+        if self.location is None or self.spread is None:
+            return log
+        cov = value if self.is_matrix else value[..., None, None]
+        cov = (cov if self.is_inverse else np.linalg.inv(cov)) * self.spread[..., None, None]
+        away = (values[self.names[0]] - self.location).reshape(*cov.shape[:-1])
+        root = np.linalg.cholesky(cov)
+        z = np.linalg.solve(root, away[..., None])[..., 0]
+        each = -0.5 * (z**2 + _LOG_2PI) - np.log(np.linalg.diagonal(root))
+        return log + each.reshape(len(log), -1).sum(axis=1)
+
     def marginal(self, name: str) -> Marginal | None:
         if name != self.own:
             return self._location()
@@ -195,6 +222,10 @@ class SharePart:
         with np.errstate(all="ignore"):
             log = self.known.total(family.log_prob(value))
         return {self.names[0]: self.known.put(value, int(self.is_simplex))}, log
+
+    def log_density(self, values: Values) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return self.known.total(self.distribution.log_prob(values[self.names[0]]))
 
     def marginal(self, name: str) -> Marginal | None:
         if self.known.mask is not None:
@@ -245,6 +276,14 @@ class TablePart:
         }
         return values, log.reshape(draws, -1).sum(axis=1)
 
+    def log_density(self, values: Values) -> np.ndarray:
+        states = tuple(values[name].astype(np.intp) for name in self.names)
+        state = np.ravel_multi_index(states, self.sizes)
+        with np.errstate(divide="ignore"):
+            logs = np.log(self.table / self.table.sum(axis=0))
+        log = np.take_along_axis(logs[None], state[:, None], axis=1)[:, 0]
+        return log.reshape(len(log), -1).sum(axis=1)
+
     def probabilities(self, name: str) -> np.ndarray:
         """Of one node, shape (*plates, states)."""
         whole = self.table.reshape(*self.sizes, *self.table.shape[1:])
@@ -286,6 +325,18 @@ class FreePart:
             log = log - self.factor.log_volume(u, self.factor.target.known)
             values = self.factor.constrained(u, self.factor.target.known)
         return values, log
+
+    def log_density(self, values: Values) -> np.ndarray:
+        assert self.factor is not None
+        known = self.factor.target.known
+        with np.errstate(all="ignore"):
+            u = self.factor.freed({**known, **values})
+            away = u - self.mean
+            full = self.root.ndim == 2
+            z = np.linalg.solve(self.root, away.T).T if full else away / self.root
+            diagonal = np.diagonal(self.root) if full else self.root
+            log = -0.5 * (z**2 + _LOG_2PI).sum(axis=1) - np.log(np.abs(diagonal)).sum()
+            return log - self.factor.log_volume(u, known)
 
     def marginal(self, name: str) -> Marginal | None:
         if name not in self.closed:

@@ -145,7 +145,7 @@ class Importance(WeightedEngine):
     def _require_functions(self) -> None:
         if any(spec is None for spec in self.proposal.values()):
             raise UnsupportedError(
-                "Importance: this engine was unpickled, and pickles carry no functions; make it anew"
+                "Importance: this engine is a pickle's or a file's, which hold no functions; give it anew"
             )
 
     def __getstate__(self) -> dict[str, Any]:
