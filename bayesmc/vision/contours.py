@@ -248,7 +248,7 @@ class ShapeSpace:
         return points, normals
 
     def _lines(self, state: Any, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """And how much of the outline each stands for, (..., count): of the template 1 on average."""
+        """And how far apart they are, over how far on the template, (..., count)."""
         state = self._checked(state)
         at, along = self.template._at(count)
         apart = at @ self.template.control - self.template.center
@@ -259,8 +259,8 @@ class ShapeSpace:
         normals = np.stack([tangents[..., 1], -tangents[..., 0]], axis=-1)
         length = np.sqrt(np.vecdot(normals, normals))
         normals /= np.where(length > 0, length, 1.0)[..., None]
-        typical = np.hypot(*directions.T).mean()
-        return points, normals, length / (typical if typical > 0 else 1.0)
+        own = np.hypot(*directions.T)
+        return points, normals, length / np.where(own > 0, own, 1.0)
 
     def basis(self, count: int) -> np.ndarray:
         """How points along the outline move with the state, shape (count, 2, size): linear throughout."""

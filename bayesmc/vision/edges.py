@@ -50,9 +50,9 @@ class ContourEdges:
     ``reach`` and in the frame. In the middle of a frame it is 1, all but. A line outside the frame was not
     searched, and counts 1: it says neither that the outline is there nor that it is not. So outlines of
     which different parts are in the frame compare with each other, and with one that is out of sight, whose
-    log density is 0. The log density is the sum of the logarithms over the normals, times ``tempering``,
-    each by the length of the outline that it stands for, in lengths of the template's: normals that crowd
-    together on an outline that has shrunk see the same edge, and it counts once.
+    log density is 0. The log density is the sum of the logarithms over the normals, times ``tempering``.
+    Where normals are closer together than on the template they see one edge several times: what they find (a
+    logarithm above 0) counts by how close they are, and what they miss counts in full.
 
     Parameters
     ----------
@@ -212,7 +212,8 @@ class ContourEdges:
             seen = self._seen(points, normals)
             in_sight |= bool(seen.any())
             ratio = 1 + there * (found.astype(np.float32) @ near - seen)
-            log[part] = np.vecdot(np.log(ratio), share)
+            each = np.log(ratio)
+            log[part] = np.where(each > 0, each * np.minimum(share, 1.0), each).sum(axis=-1)
         if not in_sight and len(states) > 1:
             self._out_of_sight(states)
         return self.tempering * log
