@@ -86,7 +86,7 @@ from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.objects import FrozenObject
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
-from bayesmc.results import Elpd, Marginal, Posterior, SeriesPosterior, Summary, compare
+from bayesmc.results import Elpd, Marginal, Pictures, Posterior, SeriesPosterior, Summary, compare
 from bayesmc.storage import CheckpointFile
 from bayesmc.structure.log_density import log_density
 
@@ -194,8 +194,15 @@ __all__ = [
 ]
 
 
+_LATER = ("io", "markov", "montecarlo", "plotting", "robotics", "sklearn", "testing", "vision")
+
+
 def __getattr__(name: str) -> Any:
     """What not every program needs loads when first asked for."""
-    if name in ("io", "markov", "montecarlo", "plotting", "robotics", "testing", "vision"):
+    if name in _LATER:
         return importlib.import_module(f"bayesmc.{name}")
     raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")
+
+
+# answers stand below what draws them
+Pictures.known = lambda: importlib.import_module("bayesmc.plotting").PICTURES

@@ -8,6 +8,7 @@ from benchmarks import (
     bench_approximate,
     bench_exact,
     bench_fading,
+    bench_fit,
     bench_gaussian,
     bench_gibbs,
     bench_marginal,
@@ -53,6 +54,9 @@ if __name__ == "__main__":
     bench_robots.main(sys.argv[1:])
     print()
     if "--short" not in sys.argv[1:]:  # many minutes
+        if data_folder().exists():
+            bench_fit.main()
+            print()
         bench_fading.main()
         print()
         bench_robot_logs.main()

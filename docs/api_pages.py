@@ -15,7 +15,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.filtering import FilterEngine
 
 #: rooms with a page of their own
-MODULES = ("io", "markov", "montecarlo", "plotting", "robotics", "testing", "vision")
+MODULES = ("io", "markov", "montecarlo", "plotting", "robotics", "sklearn", "testing", "vision")
 TITLES = {
     "models": "Models: nets, templates, factor graphs",
     "asking": "Asking: infer, filter, smooth, explain",
@@ -29,6 +29,7 @@ TITLES = {
     "montecarlo": "Monte Carlo without nets",
     "plotting": "Pictures",
     "robotics": "Robots",
+    "sklearn": "scikit-learn",
     "testing": "Testing samplers",
     "vision": "Vision",
 }

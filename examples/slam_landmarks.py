@@ -20,24 +20,27 @@ and Fox (2005), Probabilistic Robotics, chapter 13.
 from __future__ import annotations
 
 import tempfile
-import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import AndAngle, PoseNormal, bearing_to, compose, range_to
+from bayesmc.robotics import AndAngle, PoseNormal, bearing_to, compose, range_to, wrap
 from examples import picture, reference
 from examples.robot_landmarks import Drive, ellipse, marks_seen, write_mrclam
 
 SPREAD, LASTING = 0.07, 200.0  # of the wheels' gains, as in `landmark_localization`
-PER_METRE, PER_RADIAN, PER_SECOND = 5e-4, 5e-3, 1e-5  # variances that build up, in m^2 and rad^2
-RANGE, BEARING = 0.15, 0.02  # m, rad
+PER_METRE, PER_RADIAN, PER_SECOND = 5e-4, 1e-2, 1e-5  # variances that build up, in m^2 and rad^2
+RANGE, BEARING = 0.4, 0.05  # m, rad: wider than one error, which lasts over many readings
 VAGUE, GUESSED = 30.0, 2.0  # m: standard deviations of a landmark's place beforehand
-NEW, CLUTTER = 0.02, 0.002  # of readings: shares of landmarks not met before, and of none
-PLACES = 25  # landmarks that a map has room for, where their number is not known
+# Where it is not known which landmark is read:
+OFF, LASTS = 0.05, 5.0  # shares that ranges are off by, and the seconds for which they are
+FAST_RANGE, FAST_BEARING = 0.06, 0.015  # m, rad: what is left, another in each reading
+EAGER, CLUTTER = 3.0, 0.0005  # to meet new landmarks; share of readings that are of none
+NEAR_RANGE, NEAR_BEARING = 0.15, 0.02  # m, rad: by which nearness is judged
+PLACES, HALL = 25, 8.0  # landmarks that a map has room for; m, how far they stand
 
 
 class Readings(NamedTuple):
@@ -134,26 +137,36 @@ def unknown_net(start: np.ndarray, places: int = PLACES) -> bmc.DynamicBayesNet:
     """Readings that say nothing: each particle counts the landmarks it has met, and picks.
 
     States of ``which``: the landmarks met, then ``places`` (a new one, which gets the next number) and
-    ``places + 1`` (none: a reading from anywhere).
-    """
-    dbn = with_marks(robot(start, places), np.zeros(2), VAGUE)
-    dbn.input("heard")
-    dbn.input(
-        "again"
-    )  # whether it is of the same instant as the reading before, so of another landmark
+    ``places + 1`` (none: a reading from anywhere). That a reading is of a new one is the less likely the more
+    readings there were, as in a Chinese restaurant process. Readings of one instant are of different
+    landmarks: those that are ``taken`` are out, one bit for each.
 
-    def shares(met, other=-1, again=0):
-        met, other = np.asarray(met)[..., None], np.where(again, other, -1)[..., None]
-        old = np.where(np.arange(places) < met, (1 - NEW - CLUTTER) / np.maximum(met, 1), 0.0)
-        old = np.where(np.arange(places) == other, 0.0, old)
-        new = np.where(met == 0, 1 - CLUTTER, np.where(met < places, NEW, 0.0))
-        every = np.concatenate([old, new, CLUTTER + 0 * new], axis=-1)
+    Who picks by the size of what is off must know how errors come about: a range is off by a share of it that
+    lasts for seconds and is each landmark's own, so this share is carried with the landmark's place.
+    """
+    dbn = with_marks(robot(start, places), np.zeros(2), HALL)
+    for name in ("heard", "count", "again"):  # read at all, readings before, of the same instant
+        dbn.input(name)
+
+    @dbn.node(plates="landmark", initial=bmc.Normal(0.0, OFF))
+    def off(off_prev, effort):
+        kept = np.exp(-effort[..., 2] / LASTS)
+        return bmc.Normal(kept * off_prev, OFF * np.sqrt(1 - kept**2 + 1e-8))
+
+    def shares(met, count, taken):
+        met, count, taken = (np.asarray(a)[..., None] for a in (met, count, taken))
+        free = (np.arange(places) < met) & (taken >> np.arange(places) & 1 == 0)
+        new = np.where(met < places, EAGER / (EAGER + count), 0.0)
+        old = np.where(free, (1 - new) / np.maximum(met, 1), 0.0)
+        every = np.concatenate(
+            [(1 - CLUTTER) * old, (1 - CLUTTER) * new, CLUTTER + 0 * new], axis=-1
+        )
         return bmc.Categorical(every / every.sum(axis=-1, keepdims=True))
 
     dbn.add(
         "which",
-        lambda met_prev, number_prev, again: shares(met_prev, number_prev, again),
-        initial=lambda: shares(0),
+        lambda met_prev, taken_prev, count, again: shares(met_prev, count, taken_prev * again),
+        initial=lambda count: shares(0, count, 0),
     )
     dbn.add(
         "met",
@@ -166,14 +179,25 @@ def unknown_net(start: np.ndarray, places: int = PLACES) -> bmc.DynamicBayesNet:
         new = np.minimum(met_prev, places - 1)
         return np.where(which == places, new, np.minimum(which, places - 1))
 
+    def bit(number, which, heard):
+        return (1 << number.astype(int)) * (which <= places) * heard
+
+    dbn.add(
+        "taken",
+        lambda taken_prev, number, which, heard, again: (
+            taken_prev * again + bit(number, which, heard)
+        ),
+        initial=bit,
+    )
+
     @dbn.node
-    def seen(pose, mark, number, which):
-        place, none = mark[number.astype(int)], which == places + 1
-        reach = np.where(none, 2.0, range_to(pose, place))
-        angle = np.where(none, 0.0, bearing_to(pose, place))
+    def seen(pose, mark, off, number, which):
+        k, none = number.astype(int), which == places + 1
+        reach = np.where(none, 4.0, range_to(pose, mark[k]) * (1 + off[k]))
+        angle = np.where(none, 0.0, bearing_to(pose, mark[k]))
         return AndAngle(
-            bmc.Normal(reach, np.where(none, 2.0, RANGE)),
-            bmc.WrappedNormal(angle, np.where(none, 0.5, BEARING)),
+            bmc.Normal(reach, np.where(none, 2.0, FAST_RANGE)),
+            bmc.WrappedNormal(angle, np.where(none, 0.5, FAST_BEARING)),
         )
 
     return dbn
@@ -203,15 +227,16 @@ def with_labels(
 
 def without_labels(readings: Readings, drive: Drive, engine: Any, seed: int = 0) -> Any:
     """Beliefs where it is not known."""
-    again = np.diff(readings.times, prepend=-1.0) == 0
-    inputs = {**readings.inputs, "heard": (readings.which >= 0) * 1, "again": again * 1}
-    dbn = unknown_net(drive.start)
-    rows = {"seen": readings.seen}
-    with (
-        warnings.catch_warnings()
-    ):  # a reading that is nobody's surprises all particles: known here
-        warnings.simplefilter("ignore", bmc.errors.LowEssWarning)
-        return bmc.filter(dbn, rows, inputs=inputs, engine=engine, rng=seed, keep="particles")
+    heard = readings.which >= 0
+    again = (np.diff(readings.times, prepend=-1.0) == 0) & heard
+    inputs = {
+        **readings.inputs,
+        "heard": heard * 1,
+        "count": np.cumsum(heard) - heard,
+        "again": again * 1,
+    }
+    dbn, rows = unknown_net(drive.start), {"seen": readings.seen}
+    return bmc.filter(dbn, rows, inputs=inputs, engine=engine, rng=seed, keep="particles")
 
 
 def assigned(found: Any) -> np.ndarray:
@@ -227,16 +252,29 @@ def assigned(found: Any) -> np.ndarray:
     return numbers
 
 
+def _counts(numbers: np.ndarray, readings: Readings, marks: int) -> np.ndarray:
+    """How often each number of a path was given to readings of each landmark."""
+    some = (readings.which >= 0) & (numbers >= 0)
+    counts = np.zeros((PLACES, marks))
+    np.add.at(counts, (numbers[some], readings.which[some]), 1)
+    return counts
+
+
 def share_right(numbers: np.ndarray, readings: Readings, marks: int) -> float:
     """Of readings, the share whose landmark is right: numbers are matched one to one with landmarks."""
     from scipy.optimize import linear_sum_assignment
 
-    heard = readings.which >= 0
-    counts = np.zeros((PLACES, marks))
-    some = heard & (numbers >= 0)
-    np.add.at(counts, (numbers[some], readings.which[some]), 1)
+    counts = _counts(numbers, readings, marks)
     rows, columns = linear_sum_assignment(-counts)
-    return float(counts[rows, columns].sum() / heard.sum())
+    return float(counts[rows, columns].sum() / (readings.which >= 0).sum())
+
+
+def share_near(numbers: np.ndarray, readings: Readings, marks: np.ndarray) -> float:
+    """Of readings, the share within .3 m of the right one: a number stands for what it is read as most."""
+    counts = _counts(numbers, readings, len(marks))
+    near = np.hypot(*(marks[:, None] - marks).T) < 0.3
+    own = (counts * near[counts.argmax(axis=1)]).sum()
+    return float(own / (readings.which >= 0).sum())
 
 
 def map_rmse(marks: np.ndarray, truth: np.ndarray) -> float:
@@ -254,31 +292,89 @@ def moved_onto(marks: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return one @ np.array([[c, s], [-s, c]]) + truth.mean(axis=0)
 
 
-def fast_slam(particles: int) -> bmc.ParticleFilter:
+def fast_slam(particles: int, *more: str) -> bmc.ParticleFilter:
     """FastSLAM 2.0; without ``proposal`` it is FastSLAM 1.0."""
-    return bmc.ParticleFilter(particles, marginalize="mark", proposal="optimal")
+    return bmc.ParticleFilter(particles, marginalize=("mark", *more), proposal="optimal")
 
 
 def figures(
     folder: Path, robots: Sequence[int] = (1, 2, 3, 4, 5), particles: int = 100
-) -> dict[int, dict[str, float]]:
-    """Errors in m of the robots of an MRCLAM folder, and the share of readings assigned right."""
-    found = {}
+) -> Iterator[tuple[int, dict[str, float]]]:
+    """Errors in m of the robots of an MRCLAM folder where it is known which landmark is read, one by one."""
     for k in robots:
         drive = marks_seen(folder, k)
         readings = one_by_one(drive)
         vague = with_labels(readings, drive, fast_slam(particles))
         same = with_labels(readings, drive, fast_slam(particles), guessed=True)
         kalman = with_labels(readings, drive, bmc.ExtendedKalmanFilter(), guessed=True)
-        lost = without_labels(readings, drive, fast_slam(20))
-        found[k] = {
-            "map": map_rmse(vague.mean("mark")[-1], drive.marks),
-            "pose": readings.rmse(vague.mean("pose")),
-            "pose, guessed": readings.rmse(same.mean("pose")),
-            "pose, EKF-SLAM": readings.rmse(kalman.mean("pose")),
-            "right": share_right(assigned(lost), readings, len(drive.marks)),
-        }
-    return found
+        yield (
+            k,
+            {
+                "map": map_rmse(vague.mean("mark")[-1], drive.marks),
+                "pose": readings.rmse(vague.mean("pose")),
+                "map, guessed": map_rmse(same.mean("mark")[-1], drive.marks),
+                "pose, guessed": readings.rmse(same.mean("pose")),
+                "map, EKF-SLAM": map_rmse(kalman.mean("mark")[-1], drive.marks),
+                "pose, EKF-SLAM": readings.rmse(kalman.mean("pose")),
+            },
+        )
+
+
+def picks(
+    folder: Path, robots: Sequence[int] = (1, 2, 3, 4, 5), particles: int = 40
+) -> Iterator[tuple[int, dict[str, float]]]:
+    """Shares of readings assigned right where it is not known, beside those of who knows pose and map."""
+    for k in robots:
+        drive = marks_seen(folder, k)
+        readings = one_by_one(drive)
+        found = without_labels(readings, drive, fast_slam(particles, "off"))
+        numbers = assigned(found)
+        yield (
+            k,
+            {
+                "right": share_right(numbers, readings, len(drive.marks)),
+                "within .3 m": share_near(numbers, readings, drive.marks),
+                "met": float(found.mean("met")[-1]),
+                **ceilings(readings, drive.marks),
+            },
+        )
+
+
+def ceilings(readings: Readings, marks: np.ndarray) -> dict[str, float]:
+    """Shares right of who knows every pose and the map, and looks at readings as independent.
+
+    The nearest landmark, by deviations of range and bearing; the same with each landmark once in an instant;
+    and with parabolas of the robot's own in range, fitted to what is off, taken away.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    known = np.flatnonzero((readings.which >= 0) & np.isfinite(readings.truth[:, 0]))
+    pose, seen, which = readings.truth[known], readings.seen[known], readings.which[known]
+    off = seen[:, None, :] - np.stack(
+        [range_to(pose[:, None], marks), bearing_to(pose[:, None], marks)], axis=-1
+    )
+    off[..., 1] = wrap(off[..., 1])
+    _, instant = np.unique(readings.times[known], return_inverse=True)
+
+    def once(cost: np.ndarray) -> float:
+        right = 0
+        for rows in np.split(np.arange(len(which)), np.flatnonzero(np.diff(instant)) + 1):
+            own, other = linear_sum_assignment(cost[rows])
+            right += int((which[rows][own] == other).sum())
+        return right / len(which)
+
+    cost = np.square(off / [NEAR_RANGE, NEAR_BEARING]).sum(axis=-1)
+    true = off[np.arange(len(which)), which]
+    powers, fitted = np.vander(seen[:, 0], 3), np.zeros_like(true)
+    for _ in range(3):  # without what is far off
+        usual = (np.abs(true - fitted) < 4 * np.array([NEAR_RANGE, NEAR_BEARING])).all(axis=-1)
+        fitted = powers @ np.linalg.lstsq(powers[usual], true[usual], rcond=None)[0]
+    mended = np.square((off - fitted[:, None]) / [NEAR_RANGE, NEAR_BEARING]).sum(axis=-1)
+    return {
+        "told all: nearest": float((cost.argmin(axis=1) == which).mean()),
+        "each once": once(cost),
+        "and unbiased": once(mended),
+    }
 
 
 def draw(drive: Drive, readings: Readings, found: Any, kalman: Any, spread: np.ndarray) -> Any:
@@ -294,7 +390,7 @@ def draw(drive: Drive, readings: Readings, found: Any, kalman: Any, spread: np.n
     for place, cov in zip(found.mean("mark")[-1][met], spread[met], strict=True):
         ax.plot(*ellipse(place, cov, 3.0), color=picture.OTHER, lw=1.4)
         ax.plot(*place, ".", color=picture.OTHER)
-    ax.set(aspect="equal", xlabel="x in m", ylabel="y in m", title="landmarks with 3 sd ellipses")
+    ax.set(aspect="equal", xlabel="x in m", ylabel="y in m", title="landmarks, 3 sd given the path")
     low, high = drive.marks.min(axis=0) - 2.0, drive.marks.max(axis=0) + 2.0
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=4, fontsize=9)
@@ -326,18 +422,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = picture.options(__doc__, arguments)
     name, drive = log(options.fast)
     readings = one_by_one(drive, 25.0 if options.fast else np.inf)
-    count = 20 if options.fast else 100
-    found = with_labels(readings, drive, fast_slam(count))
+    found = with_labels(readings, drive, fast_slam(20 if options.fast else 400))
     kalman = with_labels(readings, drive, bmc.ExtendedKalmanFilter(), guessed=True)
     short = one_by_one(drive, 8.0 if options.fast else 150.0)
-    picks = assigned(without_labels(short, drive, fast_slam(10 if options.fast else 20)))
+    engine = fast_slam(10 if options.fast else 30, "off")
+    numbers = assigned(without_labels(short, drive, engine))
     met = np.unique(readings.which[readings.which >= 0])
     print(f"Mapping while moving: {name}, {readings.times[-1]:.0f} s, {len(met)} landmarks met")
-    maps = [map_rmse(b.mean("mark")[-1][met], drive.marks[met]) for b in (found, kalman)]
-    for engine, belief, error in zip(("FastSLAM", "EKF-SLAM"), (found, kalman), maps, strict=True):
-        print(f"  {engine:10} path {readings.rmse(belief.mean('pose')):.2f} m, map {error:.2f} m")
-    right = share_right(picks, short, len(drive.marks))
-    print(f"  not told which landmarks: {100 * right:.0f} % of readings assigned right")
+    for engine_name, belief in (("FastSLAM", found), ("EKF-SLAM", kalman)):
+        marks, var = (a[-1][met] for a in (belief.mean("mark"), belief.var("mark")))
+        path, after = readings.rmse(belief.mean("pose")), map_rmse(marks, drive.marks[met])
+        off = np.sqrt((np.square(marks - drive.marks[met]) / var).mean())
+        print(
+            f"  {engine_name:10} path {path:.2f} m, map {after:.2f} m, before it is turned", end=" "
+        )
+        print(f"{off:.0f} times what its spread tells")
+    right = share_right(numbers, short, len(drive.marks))
+    near = share_near(numbers, short, drive.marks)
+    print(f"  not told which landmarks: {100 * right:.0f} % of readings assigned right,", end=" ")
+    print(f"{100 * near:.0f} % within .3 m")
     spread = found.var("mark")[-1][:, :, None] * np.eye(2)
     picture.save(draw(drive, readings, found, kalman, spread), options.out, "slam_landmarks")
 

@@ -13,8 +13,8 @@ from matplotlib import pyplot
 from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch
 
 import bayesmc as bmc
+from bayesmc.drawing.layout import Layout, Rectangle, layered_layout
 from bayesmc.plotting import plot_dag, plot_marginal, plot_prior_posterior
-from bayesmc.plotting.layout import Layout, Rectangle, layered_layout
 
 pyplot.switch_backend("agg")
 

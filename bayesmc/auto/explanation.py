@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
+from html import escape
 from typing import Any
 
+from bayesmc.drawing.html import listed, table
 from bayesmc.engines.base import Treatment
 
 #: lines from which they are put together
@@ -71,6 +73,19 @@ class Explanation:
             lines.append(f"  ... and {len(shown) - 40} more lines")
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        """As notebooks show it."""
+        parts = [f"<div><b>engine: {escape(repr(self.engine))}</b></div>"]
+        why = [*self.reasons, *([f"runs {self.effort}"] if self.effort else [])]
+        parts.append(listed("because", why))
+        parts.append(listed("not", [f"{name}: {what}" for name, what in self.refused.items()]))
+        if self.table:
+            head, *rows = _cells(self.table)
+            parts.append(table(head, rows))
+        elif self.nodes:
+            parts.append(table(["node", ""], together(list(self.nodes.items()))))
+        return f"<div>{''.join(parts)}</div>"
+
 
 def together(
     lines: Sequence[tuple[str, ...]], varied: Sequence[int] = (), summed: Sequence[int] = ()
@@ -118,17 +133,11 @@ def together(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _columns(table: Sequence[Treatment]) -> list[str]:
-    """A table of nodes in aligned columns; columns that are empty throughout are left out."""
-    names = [f.name for f in fields(Treatment) if f.name != "why"] + ["why"]
-    shown = [n for n in names if any(getattr(row, n) for row in table)]
-    rows = [tuple(str(getattr(row, n) or "") for n in shown) for row in table]
-    varied, summed = ([shown.index(n)] if n in shown else [] for n in ("colour", "cost"))
-    rows = together(rows, varied, summed)
-    for at in summed:
-        rows = [(*row[:at], _percent(row[at]), *row[at + 1 :]) for row in rows]
-    cells = [tuple(shown), *rows[:60]]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(shown))]
+def _columns(treated: Sequence[Treatment]) -> list[str]:
+    """A table of nodes in aligned columns."""
+    cells = _cells(treated)
+    rows, cells = cells[1:], cells[:61]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(cells[0]))]
     lines = [
         "  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
         for row in cells
@@ -136,6 +145,18 @@ def _columns(table: Sequence[Treatment]) -> list[str]:
     if len(rows) > 60:
         lines.append(f"  ... and {len(rows) - 60} more lines")
     return lines
+
+
+def _cells(treated: Sequence[Treatment]) -> list[tuple[str, ...]]:
+    """A table of nodes, its head first; columns that are empty throughout are left out."""
+    names = [f.name for f in fields(Treatment) if f.name != "why"] + ["why"]
+    shown = [n for n in names if any(getattr(row, n) for row in treated)]
+    rows = [tuple(str(getattr(row, n) or "") for n in shown) for row in treated]
+    varied, summed = ([shown.index(n)] if n in shown else [] for n in ("colour", "cost"))
+    rows = together(rows, varied, summed)
+    for at in summed:
+        rows = [(*row[:at], _percent(row[at]), *row[at + 1 :]) for row in rows]
+    return [tuple(shown), *rows]
 
 
 def _percent(share: str) -> str:

@@ -17,6 +17,7 @@ from bayesmc.engines.exact.many import Prepared, TablePosteriors
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import BayesmcError, EvidenceError, InterruptWarning
 from bayesmc.network import BayesNet, FactorGraph, Problem
+from bayesmc.network.columns import is_frame, rows_of
 from bayesmc.randomness import child, seed_sequence
 from bayesmc.results import Posterior
 from bayesmc.results.many import Posteriors
@@ -29,7 +30,7 @@ _UNITS, _MOST = 8, 64
 
 def infer_many(
     net: BayesNet | FactorGraph | DynamicBayesNet,
-    evidence: Sequence[Mapping[str, Any] | None],
+    evidence: Any,
     *,
     inputs: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     engine: Any = None,
@@ -47,8 +48,9 @@ def infer_many(
     ----------
     net : BayesNet, FactorGraph or DynamicBayesNet
         Compiled once for all sets with the same plate sizes.
-    evidence : sequence of dict
-        One for each question; of a template, observations of one series each.
+    evidence : sequence of dict, or DataFrame
+        One for each question; of a template, observations of one series each. Of a data frame each row is a
+        question, with what is missing unobserved.
     inputs : dict or sequence of dict, optional
         The same for all, or one for each set.
     engine : optional
@@ -204,6 +206,8 @@ def _posed(
 
 def _read_sets(evidence: Any) -> list[Any]:
     fix = "give a list of dicts, one for each question"
+    if is_frame(evidence):
+        return rows_of(evidence, "infer_many")
     if isinstance(evidence, (Mapping, str)) or not hasattr(evidence, "__iter__"):
         raise EvidenceError(f"infer_many: evidence is a {type(evidence).__name__}; {fix}")
     sets = list(evidence)

@@ -17,7 +17,7 @@ def prior_predict(
     net: BayesNet | DynamicBayesNet,
     draws: int = 1000,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     plates: Mapping[str, int] | None = None,
     steps: int | None = None,
     rng: Any = None,
@@ -73,6 +73,7 @@ def prior_predict(
         raise ModelError(
             f"prior_predict: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}"
         )
+    inputs = net.unframed(None, inputs)[1]
     model = net.model(None, inputs, plates)
     declarations = {n: c.declaration for n, c in model.nodes.items()}
     known = read_inputs(declarations, model.sizes, inputs, model.labels)

@@ -13,9 +13,10 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
+from bayesmc.dbn.calendar import last_times
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.paths import Paths, forecast_from
 from bayesmc.engines.propagation.engine import ExpectationPropagation
@@ -50,11 +51,12 @@ def filter(  # type: ignore[misc]
     Parameters
     ----------
     dbn : DynamicBayesNet
-    observations : dict
+    observations : dict or DataFrame
         Node -> its rows, time first, shape ``(time, *plates, *event)``. Row k belongs to slice k; NaN, a
-        masked entry or None is missing. Static nodes are given without time. A list of such dicts is one of
-        independent series, each with an answer of its own.
-    inputs : dict, optional
+        masked entry or None is missing. Static nodes are given without time. Of a data frame (pandas, polars,
+        pyarrow) columns are nodes and inputs, and its index or a column of dates labels the slices
+        (``.times``). A list of such is one of independent series, each with an answer of its own.
+    inputs : dict or DataFrame, optional
         Input -> its rows, time first; of several series a list of such, or one for all.
     engine : optional
         ``ParticleFilter(particles)``, ...; None chooses (see ``explain``).
@@ -182,16 +184,17 @@ def smooth(  # type: ignore[misc]
         )
     problem = pose_series(dbn, observations, inputs)
     found = _smoothed(problem, engine, seed_sequence(rng), options)
+    observations, inputs, found.times = dbn.unframed(observations, inputs)
     found.paths = Paths(problem, observations, inputs)
     return found
 
 
 def forecast(
     dbn: DynamicBayesNet | OnlineBelief,
-    observations: Mapping[str, Any] | None = None,
+    observations: Any = None,
     *,
     steps: int,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -224,18 +227,20 @@ def forecast(
             "forecast: give the observations so far, or a belief in place of the template"
         )
     problem = pose_series(dbn, observations, inputs, ahead=steps)
+    observations, inputs, times = dbn.unframed(observations, inputs)
     chosen = engine_for(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+    found.times = last_times(times, problem.steps, steps)
     found.paths = Paths(problem, observations, inputs)
     return found
 
 
 def most_likely(
     dbn: DynamicBayesNet,
-    observations: Mapping[str, Any],
+    observations: Any,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -281,17 +286,23 @@ def _filtered(
         options["executor"] = executor
     if seed is None:
         seed = seed_sequence(None) if opened is None else opened.seed(None)
+    found: SeriesPosterior
     if opened is None:
-        return chosen.filter(problem, seed, **options)
+        with picks_told(problem.slices, problem.series):
+            found = chosen.filter(problem, seed, **options)
+        found.times = problem.times
+        return found
     file, answer = opened.begin(chosen, seed, options["keep"], {"queries": options["queries"]})
     if file is None:
-        found: SeriesPosterior = answer
+        found = answer
+        found.times = problem.times
         return found
     with closing(file):
-        if chosen.saves:
-            return chosen.filter(problem, seed, **options, checkpoint=file)  # type: ignore[call-arg]
-        found = chosen.filter(problem, seed, **options)
-        if not getattr(found, "interrupted", False):
+        more: dict[str, Any] = {"checkpoint": file} if chosen.saves else {}
+        with picks_told(problem.slices, problem.series):
+            found = chosen.filter(problem, seed, **options, **more)
+        found.times = problem.times
+        if not chosen.saves and not getattr(found, "interrupted", False):
             file.finish(found)
     return found
 
@@ -320,7 +331,8 @@ def _smoothed(
     if engine is None and isinstance(chosen, ExpectationPropagation):
         return settled_or_kim(chosen, problem, queries, options["progress"])
     given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
-    return chosen.smooth(problem, seed, **given)
+    with picks_told(problem.slices, problem.series):
+        return chosen.smooth(problem, seed, **given)
 
 
 def _from_belief(

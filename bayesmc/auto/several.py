@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.errors import BayesmcError, CheckpointError, EvidenceError
+from bayesmc.network.columns import is_frame
 from bayesmc.randomness import child, parent, seed_sequence
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.run_files import header_in
@@ -29,7 +30,7 @@ def is_several(observations: Any) -> bool:
     """Whether observations are those of several series."""
     if not isinstance(observations, Sequence) or isinstance(observations, str):
         return False
-    return all(isinstance(one, Mapping) for one in observations)
+    return all(isinstance(one, Mapping) or is_frame(one) for one in observations)
 
 
 class Folder:
@@ -148,7 +149,7 @@ def _posed(
 ) -> list[SeriesProblem]:
     """All series read; what they share is one object, which travels once."""
     given = [inputs] * len(observations)
-    if inputs is not None and not isinstance(inputs, Mapping):
+    if inputs is not None and not isinstance(inputs, Mapping) and not is_frame(inputs):
         given = list(inputs)
         if len(given) != len(observations):
             raise EvidenceError(

@@ -32,9 +32,9 @@ _CHEAP = 256 * 2**20
 
 def infer(
     net: BayesNet | FactorGraph | DynamicBayesNet,
-    evidence: Mapping[str, Any] | None = None,
+    evidence: Any = None,
     *,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: Any = None,
     engine: Any = None,
     rng: Any = None,
     progress: bool | None = None,
@@ -50,10 +50,12 @@ def infer(
     net : BayesNet, FactorGraph or DynamicBayesNet
         A template is unrolled over its data: the answer is about nodes ``"x[0]"``, ``"x[1]"``, ... and its
         static nodes.
-    evidence : dict, optional
+    evidence : dict or DataFrame, optional
         Node name -> value, an array over the node's plates, or a state label. A masked entry, NaN in a
-        plated node, or None is unobserved. Of a template: observations, time first.
-    inputs : dict, optional
+        plated node, or None is unobserved. Of a template: observations, time first. Of a data frame (pandas,
+        polars, pyarrow) columns are nodes and inputs, and a column called like a plate says which element a
+        row is about.
+    inputs : dict or DataFrame, optional
         Values of the net's input nodes; of a template time first.
     engine : optional
         ``Exact()``, ``LikelihoodWeighting(draws)``, ...; None chooses (see ``explain``).

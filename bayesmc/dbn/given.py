@@ -79,6 +79,16 @@ def check_frame(what: str, value: Any) -> None:
         )
 
 
+def is_plain(data: Any) -> bool:
+    """Whether data are a dict (or none) of what has no index of its own."""
+    if data is None:
+        return True
+    if not isinstance(data, dict):
+        return False
+    listed = (np.ndarray, list, tuple, str)
+    return not any(not isinstance(v, listed) and hasattr(v, "index") for v in data.values())
+
+
 def is_missing(row: Any) -> bool:
     """Whether a whole row is missing."""
     if row is None or row is np.ma.masked:

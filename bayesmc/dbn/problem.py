@@ -30,6 +30,8 @@ class SeriesProblem:
         A snapshot: later declarations do not reach it.
     slices : Slices
     series : Series
+    times : ndarray or None
+        What labels the slices that have rows, shape (rows,), where the data say.
     cache : dict
         What engines derived and may use again.
     """
@@ -38,6 +40,7 @@ class SeriesProblem:
     slices: Slices
     series: Series
     cache: dict[str, Any] = field(default_factory=dict, repr=False)
+    times: np.ndarray | None = None
 
     @property
     def model(self) -> Model:
@@ -98,8 +101,8 @@ def undrawn(slices: Slices) -> frozenset[str]:
 
 def pose_series(
     dbn: DynamicBayesNet,
-    observations: Mapping[str, Any] | None,
-    inputs: Mapping[str, Any] | None = None,
+    observations: Any,
+    inputs: Any = None,
     ahead: int = 0,
 ) -> SeriesProblem:
     """Validate the template, read the data, and take the snapshot; ``ahead`` slices more have no rows.
@@ -110,10 +113,11 @@ def pose_series(
     """
     if not isinstance(dbn, DynamicBayesNet):
         raise ModelError(f"expected a DynamicBayesNet, not {type(dbn).__name__}")
+    observations, inputs, times = dbn.unframed(observations, inputs)
     try:
         links = observed_links(dbn, observations if isinstance(observations, Mapping) else {})
     except BayesmcError:  # with stand-ins for inputs; the data may do better, or say it better
         links = {}
     dbn = dbn.with_links(links) if links else dbn
     slices, series = read_series(dbn, observations, inputs, ahead=ahead)
-    return SeriesProblem(dbn.copy(), slices, series)
+    return SeriesProblem(dbn.copy(), slices, series, times=times)

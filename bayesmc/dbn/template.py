@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayesmc.dbn.frames import unframed_series
+from bayesmc.dbn.given import is_plain
 from bayesmc.dbn.series import unrolled
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
+from bayesmc.dbn.two_slices import template_html
 from bayesmc.dbn.unroll import sampled, unroll
 from bayesmc.distributions import Distribution
 from bayesmc.errors import (
@@ -304,11 +307,24 @@ class DynamicBayesNet:
         >>> float(bmc.infer(dbn.unroll(4), engine=bmc.Exact()).mean("x[3]"))
         6.0
         """
+        if inputs is not None:
+            inputs = self.unframed(None, inputs)[1]
         return unroll(self.template, steps, inputs)
 
-    def unrolled_evidence(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+    def unrolled_evidence(self, observations: Any) -> dict[str, Any]:
         """Evidence for the unrolled net, ``{"y[0]": row 0, ...}``; missing rows are left out."""
-        return unrolled(self.template, observations)
+        return unrolled(self.template, self.unframed(observations)[0])
+
+    def unframed(self, observations: Any, inputs: Any = None) -> tuple[Any, Any, np.ndarray | None]:
+        """Observations and inputs as dicts where they are data frames, and the times of their rows.
+
+        Raises
+        ------
+        EvidenceError
+        """
+        if is_plain(observations) and is_plain(inputs):
+            return observations, inputs, None
+        return unframed_series(self.template, observations, inputs)
 
     def sample(
         self,
@@ -355,6 +371,10 @@ class DynamicBayesNet:
 
     def __repr__(self) -> str:
         return f"DynamicBayesNet({self.name!r}, {len(self)} nodes)"
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it: two slices as a graph, and a table of nodes."""
+        return template_html(self)
 
     # ---- private ----------------------------------------------------------------------------
 

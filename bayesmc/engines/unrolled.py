@@ -48,6 +48,7 @@ def pose_any(
     """
     if not isinstance(net, DynamicBayesNet):
         return pose(net, evidence, inputs)
+    evidence, inputs, _ = net.unframed(evidence, inputs)
     series = pose_series(net, evidence, inputs)
     was = None if earlier is None else earlier.problem
     if was is not None and _same_template(was, series):

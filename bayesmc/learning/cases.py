@@ -180,18 +180,19 @@ class Cases:
         return float(weights @ np.log(mass))
 
     def _factor(self, part: Part, chosen: slice, tables: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Configurations stand last: they are many, states few, and inner loops run over what stands last."""
         if part.family is None:
             states = math.prod(part.shape)
-            allowed = np.vstack([np.eye(states), np.ones(states)])  # the last row: whatever
-            return allowed[part.shown[chosen]].reshape(-1, *part.shape)
-        rows = self._rows(tables[part.family.name], part)
+            allowed = np.column_stack([np.eye(states), np.ones(states)])  # the last one: whatever
+            return allowed[:, part.shown[chosen]].reshape(*part.shape, -1)
+        columns = self._columns(tables[part.family.name], part)
         shown = part.shown[chosen] if len(part.shown) > 1 else part.shown
-        return rows[shown].reshape(-1, *part.shape)
+        return columns[:, shown].reshape(*part.shape, -1)
 
-    def _rows(self, table: np.ndarray, part: Part) -> np.ndarray:
-        """A table with one row for each position along the shown axes."""
+    def _columns(self, table: np.ndarray, part: Part) -> np.ndarray:
+        """A table with one column for each position along the shown axes."""
         width = math.prod(part.shape)
-        return table.transpose(part.order).reshape(-1, width)
+        return np.ascontiguousarray(table.transpose(part.order).reshape(-1, width).T)
 
     def _count(
         self, count: np.ndarray, part: Part, shown: np.ndarray, posterior: np.ndarray
@@ -199,11 +200,10 @@ class Cases:
         width = math.prod(part.shape)
         if len(part.shown) == 1:  # a table that all cases share
             shown = part.shown
-        flat = posterior.reshape(len(shown), width)
         view = count.transpose(part.order)
         rows = math.prod(view.shape) // width
-        at = (shown[:, None] * width + np.arange(width)).ravel()
-        added = np.bincount(at, weights=flat.ravel(), minlength=rows * width)
+        at = (shown * width + np.arange(width)[:, None]).ravel()
+        added = np.bincount(at, weights=posterior.ravel(), minlength=rows * width)
         view += added.reshape(view.shape)
 
     # ---- reading -------------------------------------------------------------------------------
@@ -335,10 +335,10 @@ def _plan(
         live.difference_update(inputs)
         scopes.append(frozenset().union(*(scopes[i] for i in inputs)) - {best})
         live.add(len(scopes) - 1)
-        steps.append(Step(1 + best, inputs))
+        steps.append(Step(best, inputs))
         left.remove(best)
     # what is left are numbers; their product is the last one, along an axis of size 1
-    steps.append(Step(1, tuple(sorted(live))))
+    steps.append(Step(0, tuple(sorted(live))))
     return tuple(steps), largest, entries
 
 
@@ -361,7 +361,7 @@ def _backwards(
     """
     first = len(factors) - len(steps)
     slopes: list[Any] = [None] * len(factors)
-    slopes[-1] = weights.reshape(-1, *(1,) * (factors[-1].ndim - 1))
+    slopes[-1] = weights.reshape(*(1,) * (factors[-1].ndim - 1), -1)
     for k in range(len(steps) - 1, -1, -1):
         _, inputs = steps[k]
         above = slopes[first + k]

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesmc.errors import ZeroProbabilityError
+
 Tables = dict[str, np.ndarray]
 #: from tables to the log likelihood and the expected counts of their entries
 Expected = Callable[[Mapping[str, np.ndarray]], tuple[float, Mapping[str, np.ndarray]]]
@@ -51,24 +53,77 @@ def maximised(
     counts : dict
         Dirichlet counts, added to those expected; the objective has their log prior in it.
     tolerance : float
-        Rise of the objective below which it ends, in nats.
+        Rise of the objective by one plain step below which it ends, in nats.
+
+    Notes
+    -----
+    After two plain steps it goes further the way these went, by what their difference tells, and stays
+    there if the objective has not fallen (squared extrapolation).
+
+    References
+    ----------
+    Varadhan and Roland (2008), Simple and globally convergent methods for accelerating the convergence of any
+    EM algorithm, Scandinavian Journal of Statistics 35, eq. 12.
     """
     tables = {n: np.array(t) for n, t in start.items()}
     log_likelihood, found = expected(tables)
     history = [log_likelihood + _log_prior(tables, counts)]
-    converged = False
-    for _ in range(most):
-        tables = {n: _normalised(found[n] + counts[n], tables[n]) for n in tables}
+    converged, reach = False, 4.0
+    before: Tables | None = None
+    while not converged and len(history) <= most:
+        ahead = {n: _normalised(found[n] + counts[n], tables[n]) for n in tables}
+        far, length = _extrapolated(before, tables, ahead, reach)
+        told = None if far is None else _told(expected, far)
+        if far is not None and told is not None:
+            objective = told[0] + _log_prior(far, counts)
+            if objective >= history[-1]:
+                reach = 4.0 * reach if length == reach else reach
+                tables, before, (log_likelihood, found) = far, None, told
+                history.append(objective)
+                continue
+        if far is not None:
+            reach = max(1.0, 0.5 * reach)
+        before, tables = tables, ahead
         log_likelihood, found = expected(tables)
         history.append(log_likelihood + _log_prior(tables, counts))
-        if history[-1] - history[-2] < tolerance:
-            converged = True
-            break
+        converged = history[-1] - history[-2] < tolerance
     errors = _errors(expected, tables, counts)
     return Learned(tables, log_likelihood, history[-1], np.array(history), converged, errors)
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _extrapolated(
+    before: Tables | None, now: Tables, ahead: Tables, most: float
+) -> tuple[Tables | None, float]:
+    """Tables further the way of two steps, and how many steps far; None where that is no further."""
+    if before is None:
+        return None, 0.0
+    first = {n: now[n] - before[n] for n in now}
+    bend = {n: ahead[n] - now[n] - first[n] for n in now}
+    moved, bent = (
+        math.sqrt(sum(float((d**2).sum()) for d in part.values())) for part in (first, bend)
+    )
+    length = min(moved / bent, most) if bent > 0 else most
+    if length <= 1.0 or not moved:
+        return None, length
+    found = {}
+    for n in now:
+        far = before[n] + 2.0 * length * first[n] + length**2 * bend[n]
+        far = np.where(
+            far > 0, far, ahead[n]
+        )  # entries that would leave it stay where they were going
+        found[n] = far / far.sum(axis=-1, keepdims=True)
+    return found, length
+
+
+def _told(expected: Expected, tables: Tables) -> tuple[float, Mapping[str, np.ndarray]] | None:
+    """What is expected of tables; None where they make a case impossible."""
+    try:
+        return expected(tables)
+    except ZeroProbabilityError:
+        return None
 
 
 def _normalised(counts: np.ndarray, before: np.ndarray) -> np.ndarray:

@@ -18,12 +18,12 @@ from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.errors import ConvergenceWarning, ModelError, UnsupportedError, did_you_mean
 from bayesmc.learning.climbing import Maximum, maximum
-from bayesmc.learning.data import columns_of
 from bayesmc.learning.fitted import Fit
 from bayesmc.learning.objectives import Density, Evidence, Objective, hidden_numbers
 from bayesmc.learning.tables import fit_tables
 from bayesmc.learning.unknowns import Unknowns
 from bayesmc.network import BayesNet, Problem, pose
+from bayesmc.network.columns import columns_of
 from bayesmc.randomness import seed_sequence
 from bayesmc.structure.unconstrained import without_volume
 
@@ -100,7 +100,7 @@ def fit(
     Nodes are found by quasi-Newton steps on the log evidence in unconstrained coordinates, with the gradient
     of the expression graph where everything else hidden is finite, and by differences of exact evidences
     elsewhere; standard errors are those of the observed information. Tables are found by expectation-
-    maximisation, whose objective never falls.
+    maximisation with extrapolated steps, whose objective never falls.
 
     References
     ----------
@@ -119,7 +119,7 @@ def fit(
     """
     if not isinstance(net, (BayesNet, DynamicBayesNet)):
         raise ModelError(f"fit: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}")
-    data = columns_of(data)
+    data, inputs = _as_dicts(net, data, inputs)
     chosen = _chosen(net, data, inputs, learn)
     tables = [n for n in chosen if _is_table(net, n)]
     if tables:
@@ -140,6 +140,15 @@ def fit(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _as_dicts(net: BayesNet | DynamicBayesNet, data: Any, inputs: Any) -> tuple[Any, Any]:
+    """Data and inputs of data frames; of a net without plates each row is a case."""
+    if isinstance(net, DynamicBayesNet):
+        data, inputs, _ = net.unframed(data, inputs)
+    elif any(declaration.plates for declaration in net.declarations.values()):
+        data, inputs = net.unframed(data, inputs)
+    return columns_of(data), inputs
 
 
 def _is_table(net: BayesNet | DynamicBayesNet, name: str) -> bool:

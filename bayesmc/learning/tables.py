@@ -22,6 +22,7 @@ from bayesmc.learning.expectation_maximisation import Learned, Tables, maximised
 from bayesmc.learning.fitted import Fit
 from bayesmc.learning.series_counts import SeriesCounts
 from bayesmc.network import BayesNet, CompiledNode, Model
+from bayesmc.network.columns import array_of
 
 
 def fit_tables(
@@ -150,7 +151,7 @@ def _table_of(net: BayesNet, model: Model, name: str) -> np.ndarray:
 def _codes(node: CompiledNode, column: Any) -> np.ndarray:
     """Positions of states, -1 where missing."""
     assert node.domain is not None
-    values = np.ma.asarray(column) if isinstance(column, np.ma.MaskedArray) else np.asarray(column)
+    values = column if isinstance(column, np.ma.MaskedArray) else array_of(column)
     if values.ndim != 1:
         raise EvidenceError(
             f"fit: column {node.name!r} has shape {values.shape}; give one entry for each case"

@@ -274,6 +274,8 @@ def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:
         array = np.asarray(data)
         if array.dtype == object:
             try:
+                if any(isinstance(entry, str) for entry in array.ravel().tolist()):
+                    raise ValueError  # texts of numbers are no numbers
                 array = np.array(data, dtype=float)
             except (TypeError, ValueError):
                 raise EvidenceError(

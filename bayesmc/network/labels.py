@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import EvidenceError, ModelError, did_you_mean
+from bayesmc.network.columns import array_of, is_column
 from bayesmc.states import StateArray, label_code
 
 Labels = Mapping[str, tuple[Any, ...]]
@@ -45,7 +46,8 @@ def by_label(what: str, value: Any, plates: Sequence[str], labels: Labels, ahead
     """
     found = _labelled(value, plates, ahead)
     if found is None:
-        return value
+        plain = isinstance(value, np.ndarray) or not is_column(value)
+        return value if plain else array_of(value)
     array, own = found
     for k, plate in enumerate(plates):
         axis = k + ahead
@@ -80,7 +82,7 @@ def refuse_crossed(
         if found is None:
             continue
         for plate, own in zip([*(["time"] * ahead), *plates], found[1], strict=False):
-            if own is None or _is_default(own) or (plate in labels):
+            if own is None or is_default(own) or (plate in labels):
                 continue
             other, before = seen.setdefault(plate, (name, own))
             if _differ(own, before, timed and plate == "time"):
@@ -110,6 +112,11 @@ def refuse_backwards(what: str, value: Any) -> None:
             f"{what}: row {at} is labelled {own[at]!r}, before {own[at - 1]!r} of row {at - 1}; row k "
             "belongs to slice k, so sort the rows by time (sort_index()), or give .to_numpy() if they are"
         )
+
+
+def is_default(own: list[Any]) -> bool:
+    """Whether labels are 0, 1, 2, ..., which say nothing."""
+    return all(type(x) is not bool and x == k for k, x in enumerate(own))
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +281,7 @@ def _labelled(
     index = getattr(value, "index", None)
     if index is None or callable(index) or not hasattr(value, "to_numpy"):
         return None
-    array = np.asarray(value)
+    array = array_of(value)
     own: list[list[Any] | None] = [list(index)]
     columns = getattr(value, "columns", None)
     own += [] if columns is None else [list(columns)]
@@ -299,7 +306,7 @@ def _order(what: str, plate: str, own: list[Any], wanted: tuple[Any, ...]) -> li
     if own == list(wanted):
         return None
     where = {label: k for k, label in enumerate(own)}
-    if _is_default(own):
+    if is_default(own):
         if set(own) != set(wanted):
             return None
         raise EvidenceError(
@@ -326,11 +333,6 @@ def _order(what: str, plate: str, own: list[Any], wanted: tuple[Any, ...]) -> li
             "(reindex(labels))"
         )
     return [where[label] for label in wanted]
-
-
-def _is_default(own: list[Any]) -> bool:
-    """Whether labels are 0, 1, 2, ..., which say nothing."""
-    return all(type(x) is not bool and x == k for k, x in enumerate(own))
 
 
 def _differ(own: list[Any], before: list[Any], timed: bool) -> bool:

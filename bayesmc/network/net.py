@@ -24,10 +24,12 @@ from bayesmc.network.declaring import (
 )
 from bayesmc.network.evidence import read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
+from bayesmc.network.frames import unframed
 from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model, refuse_objects
 from bayesmc.network.node import Declaration, Node, Potential, decorating, without_noise
+from bayesmc.network.shown import net_html
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
 
@@ -241,6 +243,11 @@ class BayesNet(Declared):
     def __repr__(self) -> str:
         return f"BayesNet({self.name!r}, {len(self)} nodes)"
 
+    def _repr_html_(self) -> str:
+        """As notebooks show it: the graph, and a table of nodes."""
+        known, factors = self._declarations, self._potentials
+        return net_html(repr(self), known, self.__getitem__, factors, self.plates)
+
     @property
     def nodes(self) -> tuple[str, ...]:
         """Names of the nodes, as declared; ``net[name]`` describes one."""
@@ -372,6 +379,18 @@ class BayesNet(Declared):
         refuse_objects(model)
         self._store.validate(model)
         return model
+
+    def unframed(self, evidence: Any, inputs: Any = None) -> tuple[Any, Any]:
+        """Evidence and inputs as dicts where they are data frames; others as they are (``network/frames``).
+
+        Raises
+        ------
+        EvidenceError
+        """
+        if all(data is None or isinstance(data, Mapping) for data in (evidence, inputs)):
+            return evidence, inputs
+        plates = self._plates
+        return unframed(self._declarations, plates.sizes, plates.labels, evidence, inputs)
 
     def to_factor_graph(
         self,

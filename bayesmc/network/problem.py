@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,14 +40,18 @@ class Problem:
 
 def pose(
     net: BayesNet | FactorGraph,
-    evidence: Mapping[str, Any] | None,
-    inputs: Mapping[str, Any] | None = None,
+    evidence: Any,
+    inputs: Any = None,
 ) -> Problem:
-    """Validate the net or factor graph, read evidence and inputs, and take the snapshot."""
+    """Validate the net or factor graph, read evidence and inputs, and take the snapshot.
+
+    Evidence and inputs may be data frames (``frames``).
+    """
     if isinstance(net, FactorGraph):
         return Problem(*net.question(evidence, inputs))
     if not isinstance(net, BayesNet):
         raise ModelError(f"expected a BayesNet or a FactorGraph, not {type(net).__name__}")
+    evidence, inputs = net.unframed(evidence, inputs)
     question = read_question(net, evidence, inputs)
     for name, found in question[2].items():
         warn_of_doubts(question[1], name, found)

@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn.two_slices import TwoSlices
+from bayesmc.drawing.layout import Layout, Point, Rectangle, layered_layout
+from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet, Node
-from bayesmc.plotting.layout import Layout, Point, Rectangle, layered_layout
+from bayesmc.plotting.insets import Inset, draw_inset, insets_of
 from bayesmc.plotting.pyplot import pyplot
-from bayesmc.plotting.template import TwoSlices
+from bayesmc.results import Posterior
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,13 +38,13 @@ ROW = 0.34  # inches for one row of the legend
 
 
 def plot_dag(
-    net: BayesNet | DynamicBayesNet,
+    net: BayesNet | DynamicBayesNet | Posterior,
     *,
     observed: Collection[str] = (),
     ax: Axes | None = None,
     legend: bool = True,
 ) -> Axes:
-    """Draw the graph of a net with its plates, or of a template over two slices.
+    """Draw the graph of a net with its plates, or of a template over two slices; of an answer with marginals.
 
     Continuous nodes are ellipses, discrete ones rounded boxes; a deterministic node has a double
     border, an input a dashed one, and an observed node is shaded. Potentials are small black
@@ -49,10 +52,12 @@ def plot_dag(
 
     Parameters
     ----------
-    net : BayesNet or DynamicBayesNet
-        Of a template, a slice and what it reads of the slice before (``x_prev``), each in a frame.
+    net : BayesNet, DynamicBayesNet or Posterior
+        Of a template, a slice and what it reads of the slice before (``x_prev``), each in a frame. Of a
+        posterior its net with marginals in the nodes: bars of states, densities of numbers. Of a node in
+        plates every element has a cell as dark as it is probable, or a curve; of many, some evenly taken.
     observed : collection of str
-        Names of observed nodes; the evidence itself will do.
+        Names of observed nodes; the evidence itself will do. A posterior knows its own.
     ax : matplotlib.axes.Axes, optional
         Where to draw. By default a new figure of fitting size, one inch per data unit.
     legend : bool
@@ -66,6 +71,8 @@ def plot_dag(
     ------
     UnknownNodeError
         When ``observed`` names a node that the net lacks.
+    UnsupportedError
+        What is given has no graph.
     MissingExtraError
         Without matplotlib.
 
@@ -83,11 +90,10 @@ def plot_dag(
     ['discrete', 'observed', 'rain', 'wet']
     """
     plt = pyplot()
-    drawn = TwoSlices(net) if isinstance(net, DynamicBayesNet) else net
+    drawn, insets, shaded = _read(net, observed)
     nodes = [drawn[name] for name in drawn]
-    shaded = {drawn[name].name for name in observed}
     factors: Any = drawn.potentials
-    shapes = {node.name: _shape(node, node.name in shaded) for node in nodes}
+    shapes = {n.name: _shape(n, n.name in shaded, insets.get(n.name)) for n in nodes}
     shapes |= {name: _factor_shape(name) for name in factors}
     every = {node.name: node for node in nodes} | factors
     edges = [(parent, name) for name, item in every.items() for parent in item.parents]
@@ -122,21 +128,48 @@ class Shape:
     dashed: bool = False
     shaded: bool = False
     factor: bool = False
+    continuous: bool = False
+    inset: Inset | None = None
 
 
-def _shape(node: Node, shaded: bool) -> Shape:
+def _read(net: Any, observed: Collection[str]) -> tuple[Any, dict[str, Inset], set[str]]:
+    """What is drawn, what is drawn within its nodes, and which of these are observed."""
+    if isinstance(net, DynamicBayesNet):
+        drawn: Any = TwoSlices(net)
+        return drawn, {}, {drawn[name].name for name in observed}
+    if isinstance(net, BayesNet):
+        return net, {}, {net[name].name for name in observed}
+    if isinstance(net, Posterior):
+        drawn = net._live("plot_dag").net
+        if isinstance(drawn, BayesNet):
+            seen = {n: net.model[n].decode(o.value) for n, o in net._seen.items() if o.mask is None}
+            known = {drawn[name].name for name in [*observed, *seen]}
+            return drawn, insets_of(net, seen), known
+    raise UnsupportedError(
+        f"plot_dag: a {type(net).__name__} has no graph of nodes to draw; give a BayesNet, a "
+        "DynamicBayesNet, or a posterior of a net"
+    )
+
+
+def _shape(node: Node, shaded: bool, inset: Inset | None) -> Shape:
     wide = _text_width(node.name)
-    box = node.is_discrete or node.kind == "input"
+    continuous = not node.is_discrete and node.kind != "input"
+    box = not continuous or inset is not None
     width = wide + 0.30 if box else max(1.12 * wide + 0.32, 0.62)
+    height = HEIGHT
+    if inset is not None:
+        width, height = max(width, inset.width + 0.24), HEIGHT + inset.height + 0.04
     fill = DISCRETE if node.is_discrete else GIVEN if node.kind == "input" else CONTINUOUS
     return Shape(
         max(width, 0.5),
-        HEIGHT,
+        height,
         box,
         SHADE if shaded or node.kind == "fixed" else fill,
         double=node.kind == "deterministic",
         dashed=node.kind == "input",
         shaded=shaded or node.kind == "fixed",
+        continuous=continuous,
+        inset=inset,
     )
 
 
@@ -182,7 +215,14 @@ class _Pen:
         if shape.double:
             style["facecolor"] = "none"
             self.ax.add_patch(_outline(centre, shape, 0.045, zorder=3.5, **style))
-        if name:
+        if shape.inset is not None:
+            top = centre[1] + shape.height / 2
+            self.text((centre[0], top - 0.5 * HEIGHT), name)
+            width = shape.width - 0.24
+            draw_inset(
+                self.ax, shape.inset, centre[0] - width / 2, top - HEIGHT + 0.04, width, self.scale
+            )
+        elif name:
             self.text(centre, name)
 
     def plate(self, place: Rectangle, name: str) -> None:
@@ -327,11 +367,15 @@ def _legend_entries(shapes: Iterable[Shape]) -> list[tuple[Shape, str]]:
     small: dict[str, Any] = {"width": 0.34, "height": 0.2}
     boxes = all(shape.box for shape in shapes)
     looks = [
-        (Shape(**small, box=False, fill=CONTINUOUS), "continuous", lambda s: not s.box),
+        (
+            Shape(**small, box=any(s.inset is not None for s in shapes), fill=CONTINUOUS),
+            "continuous",
+            lambda s: s.continuous,
+        ),
         (
             Shape(**small, box=True, fill=DISCRETE),
             "discrete",
-            lambda s: s.box and not s.dashed and not s.factor,
+            lambda s: s.box and not (s.continuous or s.dashed or s.factor),
         ),
         (Shape(**small, box=True, fill=GIVEN, dashed=True), "input", lambda s: s.dashed),
         (

@@ -4,6 +4,7 @@ from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint
 from bayesmc.results.criteria import Elpd, compare
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
+from bayesmc.results.pictures import Pictures
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.running import Sums
 from bayesmc.results.saving import RunFile, save
@@ -18,6 +19,7 @@ __all__ = [
     "DrawsPosterior",
     "Elpd",
     "Marginal",
+    "Pictures",
     "Posterior",
     "RunFile",
     "RunningChains",

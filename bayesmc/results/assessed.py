@@ -187,19 +187,17 @@ class AssessedByDraws(Assessed):
         return self.log_likelihood(*names)
 
     def _relative_ess(self) -> float:
-        """Effective over actual draws, on average over all scalars, as ArviZ has it."""
+        """Effective over actual draws, on average over all numbers that are not known, as ArviZ has it."""
         if self._shape[0] == 1 or self.independent:
             return 1.0
         found = []
         for name in self.model.nodes:
-            node = self.model[name]
-            labelled = node.domain is not None and node.domain.labels is not None
-            kept = name in self._stored and name not in self._seen and self._is_free(name)
-            if kept and not labelled:
-                values = self._full(name, "loo").astype(float)
-                found.append(
-                    np.ravel(diagnostics.chain_statistic("mean_ess", values, self.ensemble_size))
-                )
+            if name in self._stored and self._is_free(name):
+                stored, trailing = self._stored[name], self.model[name].value_shape
+                values = np.broadcast_to(stored, self._shape + trailing).astype(float)
+                ess = diagnostics.chain_statistic("mean_ess", values, self.ensemble_size)
+                still = (values == values[:1, :1]).all(axis=(0, 1))
+                found.append(np.ravel(np.where(still, math.prod(self._shape), ess)))
         sizes = np.concatenate([np.zeros(0), *found])
         sizes = sizes[np.isfinite(sizes)]
         return float(sizes.mean() / math.prod(self._shape)) if sizes.size else 1.0

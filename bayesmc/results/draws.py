@@ -16,7 +16,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import UnknownNodeError, UnsupportedError
-from bayesmc.network import Problem, forward, read_inputs
+from bayesmc.network import BayesNet, Problem, forward, read_inputs
 from bayesmc.network.evidence import brought_sizes
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
@@ -267,6 +267,8 @@ class DrawsPosterior(AssessedByDraws, Posterior):
                     f"predict({name!r}): {self._node(name).kind} nodes are not drawn"
                 )
         seed = seed_sequence(rng)
+        if isinstance(problem.net, BayesNet):
+            inputs = problem.net.unframed(None, inputs)[1]
         source = self if self.weights is None else self.resample(draws, seed)
         return source._predict(problem, wanted, inputs, plates or {}, stream(seed, Purpose.PREDICT))
 
@@ -307,15 +309,15 @@ class DrawsPosterior(AssessedByDraws, Posterior):
             ancestors=self.ancestors,
         )
 
-    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
+    def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
         if self.weights is not None and resample is None:
             raise UnsupportedError(
                 "to_datatree: these draws are weighted and ArviZ would drop the weights; pass "
                 "resample=draws for equally weighted ones"
             )
         if resample is not None:
-            return self.resample(resample, rng).to_datatree()
-        return datatree(self)
+            return self.resample(resample, rng).to_datatree(rng=rng, **groups)
+        return datatree(self, rng=rng, **groups)
 
     # ---- private -----------------------------------------------------------------------------
 

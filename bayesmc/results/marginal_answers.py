@@ -11,6 +11,7 @@ from bayesmc.errors import QueryError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results.laws import Laws, TableLaws, entropy_of, interval_probability
 from bayesmc.results.over_time import take_templates
+from bayesmc.results.pictures import Pictures
 
 
 @take_templates
@@ -18,6 +19,11 @@ class MarginalAnswers:
     """Medians, intervals, modes, cdfs and entropies; a subclass says what it knows in ``_laws``."""
 
     model: Model
+
+    @property
+    def plot(self) -> Pictures:
+        """Pictures of this answer, as ``posterior.plot.forest()``; see ``bayesmc.plotting``."""
+        return Pictures(self)
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Posterior quantiles of every number."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from types import MappingProxyType
 from typing import Any
 
@@ -19,12 +18,14 @@ from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
 from bayesmc.network.fingerprint import fingerprint
 from bayesmc.results.assessed import Assessed
+from bayesmc.results.dataframes import Framed
 from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.over_time import expanded, take_templates
 from bayesmc.results.query import Query
 from bayesmc.results.saving import save
+from bayesmc.results.shown import posterior_html
 from bayesmc.results.table import Summary
 
 Plates = str | Sequence[str]
@@ -45,7 +46,7 @@ def quantile_levels(name: str, q: Any) -> np.ndarray:
 
 
 @take_templates
-class Posterior(Assessed, MarginalAnswers):
+class Posterior(Assessed, MarginalAnswers, Framed):
     """Answers about the nodes of a net given evidence.
 
     Attributes
@@ -203,10 +204,16 @@ class Posterior(Assessed, MarginalAnswers):
         """Posterior predictive: ``names`` drawn anew given the posterior draws of everything else."""
         raise self._cannot("predict")
 
-    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
-        """The draws as an ArviZ ``DataTree``, for ``arviz_stats.summary(tree)`` and its like.
+    def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
+        """The draws as an ArviZ ``DataTree`` (extra ``arviz``), with the groups that PyMC writes.
 
-        The extra ``arviz`` installs what these need; for pictures install arviz-plots, too.
+        Always ``posterior``, and where there are some ``sample_stats``, ``observed_data``, ``constant_data``
+        (inputs); dimensions are plates with their labels, ``time`` for slices. ``resample`` draws are made of
+        weighted or exact answers. ``groups`` ask for more:
+
+        ``log_likelihood=True`` has it point by point, for ``arviz_stats.loo``; ``predictive=True`` (or what
+        ``predict`` returned) ``posterior_predictive``; ``prior=`` (of ``prior_predict``) ``prior`` and
+        ``prior_predictive``; ``predictions=`` (of ``predict`` with new inputs) a group of that name.
         """
         raise self._cannot("to_datatree")
 
@@ -418,11 +425,8 @@ class Posterior(Assessed, MarginalAnswers):
         return self
 
     def _repr_html_(self) -> str:
-        """As notebooks show it: the summary, where there is one."""
-        try:
-            return self.summary()._repr_html_()
-        except UnsupportedError as error:
-            return f"<pre>{escape(repr(self))}\n{escape(str(error))}</pre>"
+        """As notebooks show it: the engine, the evidence, and the summary, where there is one."""
+        return posterior_html(self)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"

@@ -137,10 +137,11 @@ def groups_of(
         chains, draws = answer._shape
         axes = {"chain": range(chains)} | ({"draw": range(draws)} if lazily is None else {})
         groups[name] = Group(variables, {**axes, **coordinates})
-        diverged = getattr(answer, "divergences", None)
-        if diverged is not None:
-            both = Variable(("chain", "draw"), diverged)
-            groups["sample_stats"] = Group({"diverging": both}, axes)
+        told = {"diverging": "divergences", "energy": "energies"}
+        rows = {n: getattr(answer, own, None) for n, own in told.items()}
+        stats = {n: Variable(("chain", "draw"), v) for n, v in rows.items() if v is not None}
+        if stats:
+            groups["sample_stats"] = Group(stats, axes)
     else:
         found = _answers(answer, model)
         if found:

@@ -20,6 +20,7 @@ from bayesmc.results.marginal_answers import MarginalAnswers
 from bayesmc.results.posterior import quantile_levels
 from bayesmc.results.saving import save
 from bayesmc.results.series_checks import SeriesChecks
+from bayesmc.results.shown import ShownSeries
 from bayesmc.results.statistics import table_variance
 
 #: what is asked of answers over time that has another name here, or that only some filters have
@@ -30,7 +31,6 @@ _INSTEAD = {
     "samples": 'a ParticleFilter has particles(name), with keep="particles"',
     "particles": "a ParticleFilter has those",
     "summary": "mean(name), std(name) and quantile(name, q) are arrays, time first",
-    "plot": "mean(name), std(name) and quantile(name, q) are arrays, time first, to plot",
     "density": "a GridFilter has those",
     "grid": "a GridFilter has those",
     "pairs": "a DiscreteFilter has those",
@@ -42,7 +42,7 @@ _INSTEAD = {
 }
 
 
-class SeriesPosterior(SeriesChecks, MarginalAnswers):
+class SeriesPosterior(SeriesChecks, MarginalAnswers, ShownSeries):
     """Beliefs about the nodes of every slice.
 
     Attributes
@@ -54,6 +54,8 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     steps : int
     start : int
         The slice that the first entry belongs to.
+    times : ndarray or None, shape (time,)
+        What labels the slices in the data (dates), where they said.
     log_marginal_likelihood : float or ndarray
         Log density of all rows; one for each element of the plates that are filtered separately. Given static
         nodes that are known, whose own densities are not part of it (of ``infer`` on a template they are).
@@ -96,6 +98,7 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers):
     [[0.182, 0.818], [0.117, 0.883]]
     """
 
+    times: np.ndarray | None = None
     weight_ess: np.ndarray | None = None
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None

@@ -5,12 +5,12 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from html import escape
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import MissingExtraError, UnknownNodeError
+from bayesmc.drawing.html import figure, table
+from bayesmc.errors import UnknownNodeError, missing_extra
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,35 +66,28 @@ class Summary:
         Raises
         ------
         MissingExtraError
-            Without pandas.
+            Without pandas (the extra ``pandas``).
         """
         try:
             pandas = importlib.import_module("pandas")
         except ImportError:
-            raise MissingExtraError(
-                "to_dataframe: pandas is not installed: pip install pandas"
-            ) from None
+            raise missing_extra("pandas", "pandas") from None
         return pandas.DataFrame(self.columns, index=list(self.names))
 
     def _repr_html_(self) -> str:
         """As notebooks show it."""
-        shown = range(len(self.names)) if len(self.names) <= 60 else [*range(30), *range(-30, 0)]
-        head = "".join(f"<th>{escape(c)}</th>" for c in ("", *self.columns))
         rows = [
-            f"<tr><th>{escape(self.names[i])}</th>"
-            + "".join(f"<td>{_figure(v[i])}</td>" for v in self.columns.values())
-            + "</tr>"
-            for i in shown
+            [name, *(figure(v[i]) for v in self.columns.values())]
+            for i, name in enumerate(self.names)
         ]
-        caption = f"<caption>{escape(self.title)}</caption>" if self.title else ""
-        return f"<table>{caption}<tr>{head}</tr>{''.join(rows)}</table>"
+        return table(["", *self.columns], rows, self.title)
 
     def __str__(self) -> str:
         shown = list(range(len(self.names)))
         if len(shown) > 60:
             shown = [*shown[:30], *shown[-30:]]
         head = ["", *self.columns]
-        rows = [[self.names[i], *(_figure(v[i]) for v in self.columns.values())] for i in shown]
+        rows = [[self.names[i], *(figure(v[i]) for v in self.columns.values())] for i in shown]
         if len(self.names) > 60:
             rows.insert(30, ["..."] + [""] * len(self.columns))
         widths = [max(len(r[c]) for r in [head, *rows]) for c in range(len(head))]
@@ -110,11 +103,3 @@ class Summary:
         return "\n".join([self.title, *lines] if self.title else lines)
 
     __repr__ = __str__
-
-
-def _figure(value: float) -> str:
-    if np.isnan(value):
-        return "-"
-    if value and (abs(value) >= 1e6 or abs(value) < 1e-4):
-        return f"{value:.3g}"
-    return f"{value:.0f}" if abs(value) >= 1e4 else f"{value:.4g}"

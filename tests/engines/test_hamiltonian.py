@@ -135,6 +135,7 @@ def test_resumed_as_if_never_stopped() -> None:
         assert np.array_equal(more[name], once[name])
     assert more.divergences.shape == (3, 80)
     assert np.array_equal(more.divergences, once.divergences)
+    assert more.energies.shape == (3, 80) and np.array_equal(more.energies, once.energies)
 
 
 def test_summaries_and_starts() -> None:

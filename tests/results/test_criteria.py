@@ -51,7 +51,7 @@ def test_log_likelihoods_are_the_densities_at_the_draws() -> None:
 
 
 def test_criteria_are_arvizs_on_the_same_draws() -> None:
-    arviz_base = pytest.importorskip("arviz_base")
+    pytest.importorskip("arviz_base")
     pytest.importorskip("xarray")
     from arviz_stats import compare, loo
 
@@ -59,10 +59,7 @@ def test_criteria_are_arvizs_on_the_same_draws() -> None:
     for name, tail in {"normal": bmc.Normal, "t": student}.items():
         posterior = chains(tail)
         log = posterior.log_likelihood()["y"][..., :-1]
-        own = {n: posterior[n] for n in ("a", "b", "sd")}
-        trees[name] = loo(
-            arviz_base.from_dict({"posterior": own, "log_likelihood": {"y": log}}), pointwise=True
-        )
+        trees[name] = loo(posterior.to_datatree(log_likelihood=True), pointwise=True)
         ours[name] = posterior.loo()
         assert ours[name].elpd == pytest.approx(trees[name].elpd, abs=1e-8)
         assert ours[name].se == pytest.approx(trees[name].se, abs=1e-8)

@@ -160,8 +160,8 @@ class ApproximatePosterior(Posterior):
     def waic(self, *names: str) -> Elpd:
         return self._drawn.waic(*names)
 
-    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
-        return self._drawn.to_datatree(resample, rng)
+    def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
+        return self._drawn.to_datatree(resample, rng, **groups)
 
     # ---- the truth about it --------------------------------------------------------------------
 

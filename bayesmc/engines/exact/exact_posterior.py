@@ -283,12 +283,12 @@ class ExactPosterior(Posterior):
         source = self.resample(4000 if draws is None else draws, seed)
         return source.predict(names, inputs, plates, seed)
 
-    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
+    def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
         if resample is None:
             raise UnsupportedError(
                 "to_datatree: an exact posterior has no draws; pass resample=draws"
             )
-        return self.resample(resample, rng).to_datatree()
+        return self.resample(resample, rng).to_datatree(rng=rng, **groups)
 
     def bind(self, problem: Problem) -> None:
         super().bind(problem)

@@ -226,10 +226,7 @@ class ChainEngine(Engine):
                 raise KeyboardInterrupt
             held.put(saving.stand_ins(lengths.chains, held.draws))
         posterior = self._posterior(problem, sampler, held, loop)
-        diverged = loop.divergences(posterior._chains_and_draws[1])
-        if diverged is not None:
-            before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
-            posterior.divergences = diverged if before is None else np.hstack([before, diverged])
+        loop.tell_trajectories(posterior, resume)
         if checkpoint is not None and saving is not None and finished:
             lazily = saving.lazily(lengths.chains, held.draws) if spilled else None
             checkpoint.finish(posterior, lazily)

@@ -166,9 +166,10 @@ def joined(
         found = ChainsPosterior(
             problem, engine, stored, shape, acceptance, one.ensemble_size, one.warmup, point
         )
-        if one.divergences is not None:
-            diverged = [p.divergences[:, :draws] for p in parts if p.divergences is not None]
-            found.divergences = np.concatenate(diverged)
+        for what in ("divergences", "energies"):
+            rows = [getattr(part, what) for part in parts]
+            if all(row is not None for row in rows):
+                setattr(found, what, np.concatenate([row[:, :draws] for row in rows]))
     found.renewals = {n: sum(p.renewals[n] for p in parts) for n in one.renewals}  # type: ignore[misc]
     return found
 
@@ -293,8 +294,9 @@ def _parts(resume: Any, problem: Problem, member: Any, groups: int) -> list[Any]
             resume.warmup,
             before,
         )
-        if resume.divergences is not None:
-            part.divergences = resume.divergences[rows]
+        for what in ("divergences", "energies"):
+            if getattr(resume, what) is not None:
+                setattr(part, what, getattr(resume, what)[rows])
         found.append(part)
     return found
 

@@ -44,7 +44,8 @@ class Sampler(Protocol):
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
     Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
     ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged, and
-    ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None.
+    ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None, and
+    ``energies(state)`` the energy of each chain's last one.
     ``superchains`` (0) is set before the start, where so many groups of chains are to start as one.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
@@ -185,6 +186,8 @@ class Loop:
         self.phase = ""
         #: trajectories of each chain that diverged, before the first draw and after each
         self.diverged: list[np.ndarray] = []
+        #: energy of each chain's last trajectory, after each draw
+        self.energies: list[np.ndarray] = []
         #: saves the run as it goes on, if it is to be saved
         self.saving: Saving | None = None
         #: draws of each chain at which the present round ends
@@ -264,6 +267,9 @@ class Loop:
                     values = self._values(state)
                     if counted is not None:
                         self.diverged.append(counted(state))
+                        energies = self.sampler.energies(state)  # type: ignore[attr-defined]
+                        if energies is not None:
+                            self.energies.append(energies)
                     if known:
                         values = {**known, **values}
                     held.add(values)
@@ -279,11 +285,20 @@ class Loop:
                 self.saving.save(self, point, held)
         return held.draws == wanted
 
-    def divergences(self, draws: int) -> np.ndarray | None:
-        """Whether trajectories diverged, shape (chain, draw), of so many draws; None where there are none."""
-        if len(self.diverged) < 2:
-            return None
-        return np.asarray(np.diff(np.stack(self.diverged[: draws + 1], axis=1), axis=1) > 0)
+    def tell_trajectories(self, posterior: Any, before: Any) -> None:
+        """Note on a posterior which draws' trajectories diverged, and their energies, after those before."""
+        draws = posterior._chains_and_draws[1]
+        found: dict[str, np.ndarray] = {}
+        if len(self.diverged) > 1:
+            counts = np.stack(self.diverged[: draws + 1], axis=1)
+            found["divergences"] = np.diff(counts, axis=1) > 0
+        if self.energies:
+            found["energies"] = np.stack(self.energies[:draws], axis=1)
+        for what, rows in found.items():
+            earlier = None if before is None else getattr(before, what)
+            whole = rows if earlier is None else np.hstack([earlier, rows])
+            if whole.shape[1] == draws:  # files of earlier versions have no energies
+                setattr(posterior, what, whole)
 
     def _counting(self, state: State, held: Kept | RunningChains) -> Any:
         """What counts trajectories that diverged, where draws are kept and there are any."""

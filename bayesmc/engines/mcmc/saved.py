@@ -86,6 +86,8 @@ class SavedChains:
         rows = held.since(self.draws)
         if loop.diverged:
             rows["diverged"] = np.stack(loop.diverged[self.draws + (self.draws > 0) :])
+        if loop.energies:
+            rows["energies"] = np.stack(loop.energies[self.draws :])
         self.saver.save({**rows, "draws": held.draws - self.draws}, saved)
         self.draws = held.draws
         if self.spilled:
@@ -106,6 +108,8 @@ class SavedChains:
         loop.last = Checkpoint(saved["state"], saved["generator"], values, loop.observed)
         counts = [r["diverged"] for r in self.saver.rows() if "diverged" in r]
         loop.diverged = list(np.concatenate(counts)) if counts else []
+        energies = [r["energies"] for r in self.saver.rows() if "energies" in r]
+        loop.energies = list(np.concatenate(energies)) if energies else []
         return Begun(saved["state"], False, None)
 
     def held(self, chains: int, first: int) -> Kept:

@@ -99,6 +99,11 @@ class SweepSampler:
         counts = [m["divergences"] for m in state["memory"] if "divergences" in m]
         return np.asarray(sum(counts)) if counts else None
 
+    def energies(self, state: Mapping[str, Any]) -> np.ndarray | None:
+        """The energy of each chain's last trajectory; None where none or several kernels make some."""
+        found = [m["energy"]["last"] for m in state["memory"] if "energy" in m]
+        return np.array(found[0]) if len(found) == 1 else None
+
     # ---- for engines whose rows are no chains --------------------------------------------------
 
     def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:

@@ -66,10 +66,14 @@ def answers_of(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Means, variances and errors of means, shape ``(slices, *plates, *event)``."""
     count = len(block.slices)
-    means, variances = (
-        np.stack(parts).reshape(count, -1)
-        for parts in zip(*(p.inner.agreed(node) for p in block.slices), strict=True)
-    )
+    means, variances = np.empty((2, count, math.prod(node.value_shape)))
+    first = block.slices[0].inner
+    means[0], variances[0] = (a.reshape(-1) for a in first.agreed(node))
+    for k in range(1, count):  # what nothing has written since is not worked out again
+        inner, earlier = block.slices[k].inner, block.slices[k - 1].inner
+        means[k], variances[k] = means[k - 1], variances[k - 1]
+        some, mean, variance = inner.agreed_since(earlier, node)
+        means[k, some], variances[k, some] = mean, variance
     errors = np.zeros(means.shape)
     if len(numbers):
         own: CompiledNode = SomeNumbers(node, numbers)  # type: ignore[assignment]

@@ -13,8 +13,8 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.elements.pool import Pool
 from bayesmc.network import CompiledNode
 
-#: of layouts, by node: worked out once
-_TURNED: WeakKeyDictionary[Layout, dict[str, np.ndarray]] = WeakKeyDictionary()
+#: of layouts, by node: where its numbers stand, by element and by flat place, worked out once
+_PLACES: WeakKeyDictionary[Layout, dict[str, tuple[np.ndarray, np.ndarray]]] = WeakKeyDictionary()
 
 
 class ElementBeliefs(NamedTuple):
@@ -105,6 +105,19 @@ class ElementBeliefs(NamedTuple):
         mean, variance = one.moments_of(node)
         return mean[0], variance[0]
 
+    def agreed_since(
+        self, earlier: ElementBeliefs, node: CompiledNode
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Flat places of numbers that may be others than in earlier beliefs, their means and variances."""
+        one = self._replace(pool=self.pool.of_one())
+        if node.name in self.missing or node.name in earlier.missing:
+            every = np.arange(math.prod(node.value_shape))
+            mean, variance = one.moments_of(node)
+            return every, mean[0].reshape(-1), variance[0].reshape(-1)
+        numbers = self._places(node)[self.pool.written_since(earlier.pool)].reshape(-1)
+        mean, variance = one.moments_at(node, numbers)
+        return numbers, mean[0], variance[0]
+
     def covariance(self, nodes: Sequence[CompiledNode], shares: np.ndarray) -> np.ndarray:
         """Mean of the particles' covariances of nodes one after the other; 0 for what they know."""
         sizes = [math.prod(node.value_shape) for node in nodes]
@@ -140,18 +153,21 @@ class ElementBeliefs(NamedTuple):
 
     def _turned(self, node: CompiledNode) -> np.ndarray:
         """By flat place of a node's numbers, its place in the order of elements."""
-        kept = _TURNED.setdefault(self.layout, {})
-        if node.name not in kept:
-            places = self._places(node).reshape(-1)
-            kept[node.name] = np.empty(places.size, dtype=np.intp)
-            kept[node.name][places] = np.arange(places.size)
-        return kept[node.name]
+        return self._kept(node)[1]
 
     def _places(self, node: CompiledNode) -> np.ndarray:
         """Flat places of a node's numbers, by element and component."""
-        size = math.prod(node.value_shape)
-        packed = self.layout.packed(node, np.arange(size).reshape(node.value_shape))
-        return packed.reshape(len(self.pool.home), -1)
+        return self._kept(node)[0]
+
+    def _kept(self, node: CompiledNode) -> tuple[np.ndarray, np.ndarray]:
+        kept = _PLACES.setdefault(self.layout, {})
+        if node.name not in kept:
+            size = math.prod(node.value_shape)
+            packed = self.layout.packed(node, np.arange(size).reshape(node.value_shape))
+            turned = np.empty(size, dtype=np.intp)
+            turned[packed.reshape(-1)] = np.arange(size)
+            kept[node.name] = packed.reshape(len(self.pool.home), -1), turned
+        return kept[node.name]
 
 
 class DrawnLater(dict):

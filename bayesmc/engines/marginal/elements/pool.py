@@ -106,6 +106,15 @@ class Pool(NamedTuple):
             mean[own], root[own] = generation.mean[rows, versions], generation.root[rows, versions]
         return mean.swapaxes(0, 1), root.swapaxes(0, 1)
 
+    def written_since(self, earlier: Pool) -> np.ndarray:
+        """Elements whose beliefs stand elsewhere than in an earlier pool; others are the very same arrays."""
+        pairs = zip(self.generations, earlier.generations, strict=False)
+        is_same = np.zeros(len(self.generations), dtype=bool)
+        for k, (own, other) in enumerate(pairs):
+            is_same[k] = own.mean is other.mean and own.root is other.root
+        stays = (self.home == earlier.home) & (self.row == earlier.row) & is_same[self.home]
+        return np.flatnonzero(~stays)
+
     def put(self, ids: np.ndarray, mean: np.ndarray, root: np.ndarray) -> Pool:
         """With other beliefs about some elements: ``(particles, k, n)`` and ``(particles, k, n, n)``."""
         groups = self.generations[0].which.shape[0]

@@ -5,7 +5,7 @@ by longest path, few crossings by barycentres, coordinates by a linear program a
 Koutsofios, North and Vo 1993, IEEE Trans. Softw. Eng. 19(3)). The sides of a plate are variables of
 that program, so that a plate holds its members and nobody else.
 
-This room knows names, edges and sizes only: neither nets nor matplotlib.
+This module knows names, edges and sizes only: neither nets nor matplotlib.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.plotting.ordering import Edge, Item, Ordering, plates_of
+from bayesmc.drawing.ordering import Edge, Item, Ordering, plates_of
 
 Point = tuple[float, float]
 

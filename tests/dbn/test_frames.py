@@ -1,0 +1,151 @@
+"""Data frames over time: rows to slices, the clock that labels them, and what it is refused for."""
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.dbn.calendar import is_even, last_times
+from bayesmc.errors import EvidenceError
+
+pd = pytest.importorskip("pandas")
+DAYS = pd.date_range("2024-03-01", periods=4, freq="D")
+
+
+def sensors():
+    dbn = bmc.DynamicBayesNet(plates={"city": ["Bonn", "Ulm"]})
+    dbn.input("u")
+
+    @dbn.node(initial=bmc.Normal(0.0, 1.0), plates="city")
+    def x(x_prev, u):
+        return bmc.Normal(x_prev + u, 1.0)
+
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0), plates="city")
+    return dbn
+
+
+def level():
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    return dbn
+
+
+def long_rows():
+    rows = pd.DataFrame([(d, c) for d in DAYS for c in ("Ulm", "Bonn")], columns=["date", "city"])
+    rows["y"], rows["u"] = np.arange(8.0), np.repeat([0.0, 1.0, 0.0, 1.0], 2)
+    rows.loc[3, "y"] = None
+    return rows
+
+
+def wide_rows():
+    wide = long_rows().pivot(index="date", columns="city", values="y")
+    return wide.rename(columns="y[{}]".format).assign(u=[0.0, 1.0, 0.0, 1.0])
+
+
+Y, U = [[1, 0], [np.nan, 2], [5, 4], [7, 6]], [0.0, 1.0, 0.0, 1.0]
+
+
+def test_long_and_wide_rows() -> None:
+    dbn, rows = sensors(), long_rows()
+    wanted = bmc.filter(dbn, {"y": Y}, inputs={"u": U})
+    shuffled = rows.sample(frac=1.0, random_state=1)
+    for frame in (rows, shuffled, rows.set_index(["date", "city"]), wide_rows()):
+        found = bmc.filter(dbn, frame)
+        np.testing.assert_allclose(found.mean("x"), wanted.mean("x"))
+        assert (found.times == DAYS.to_numpy()).all()
+    smoothed = bmc.smooth(dbn, wide_rows())
+    np.testing.assert_allclose(bmc.infer(dbn, wide_rows()).mean("x"), smoothed.mean("x"))
+    assert smoothed.sample_paths(3, rng=0)["x"].shape == (3, 4, 2)
+    both = bmc.filter(dbn, [wide_rows(), rows])
+    np.testing.assert_allclose(both[1].mean("x"), wanted.mean("x"))
+
+
+def test_forecasts_go_on_with_inputs() -> None:
+    dbn, wide = sensors(), wide_rows()
+    longer = pd.DataFrame({"u": [*U, 1.0, 1.0]}, index=pd.date_range(DAYS[0], periods=6))
+    found = bmc.forecast(dbn, wide.drop(columns="u"), inputs=longer, steps=2)
+    wanted = bmc.forecast(dbn, {"y": Y}, inputs={"u": longer["u"].to_numpy()}, steps=2)
+    np.testing.assert_allclose(found.mean("x"), wanted.mean("x"))
+    assert found.times.astype("M8[D]").astype(str).tolist() == ["2024-03-05", "2024-03-06"]
+    late = longer.shift(1, freq="D")
+    with pytest.raises(EvidenceError, match="row 0 of the observations is of time 2024-03-01"):
+        bmc.forecast(dbn, wide.drop(columns="u"), inputs=late, steps=2)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.iloc[::-1], "row 1 is of time 2024-03-03, before 2024-03-04 of row 0"),
+        (lambda f: f.iloc[[0, 1, 3]], r"not at equal steps of time: .* \(rows 1 and 2\)"),
+        (lambda f: f.iloc[[0, 1, 1]], "rows 1 and 2 are both of time 2024-03-02"),
+        (lambda f: f.rename(columns={"u": "U"}), "'U' is no node, input or plate.*mean 'u'"),
+        (lambda f: f.rename(columns={"y[Ulm]": "y[ulm]"}), r"no column 'y\[Ulm\]' \(did you mean"),
+    ],
+)
+def test_rows_that_do_not_fit(change, words: str) -> None:
+    with pytest.raises(EvidenceError, match=words):
+        bmc.filter(sensors(), change(wide_rows()))
+    if "equal" in words:
+        with pytest.raises(EvidenceError, match=words):
+            series = wide_rows().drop(columns="u")
+            bmc.filter(sensors(), {"y": change(series)}, inputs={"u": U[:3]})
+
+
+def test_long_rows_without_a_time_or_a_place() -> None:
+    with pytest.raises(EvidenceError, match="say of which 'city' they are, and not of which time"):
+        bmc.filter(sensors(), long_rows().drop(columns="date"))
+    with pytest.raises(EvidenceError, match="no row is about 'Bonn'"):
+        bmc.filter(sensors(), long_rows().assign(city="Ulm"))
+
+
+def test_uneven_time_that_an_input_tells() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.input("dt")
+
+    @dbn.node(initial=bmc.Normal(0.0, 1.0))
+    def x(x_prev, dt):
+        return bmc.Normal(x_prev, np.sqrt(dt))
+
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    index = pd.to_datetime(["2020-01-01", "2020-01-02", "2020-01-05"])
+    frame = pd.DataFrame({"y": [1.0, 2.0, 3.0]}, index=index)
+    frame["dt"] = frame.index.diff().total_seconds().fillna(0.0) / 86400.0
+    wanted = bmc.filter(dbn, {"y": [1.0, 2.0, 3.0]}, inputs={"dt": [0.0, 1.0, 3.0]})
+    np.testing.assert_allclose(bmc.filter(dbn, frame).mean("x"), wanted.mean("x"))
+    with pytest.raises(EvidenceError, match="declare the time that passes as an input"):
+        bmc.filter(dbn, frame.assign(dt=1.0))
+
+
+@pytest.mark.parametrize("freq", ["D", "B", "ME", "MS", "QE", "YE", "h", "W", "15min"])
+def test_calendars_are_even_and_go_on(freq: str) -> None:
+    every = pd.date_range("2023-12-29", periods=16, freq=freq).to_numpy()
+    assert is_even(every[:14]) and not is_even(np.delete(every[:14], 5))
+    ahead = last_times(every[:14], 16, 2)
+    assert ahead is not None and (ahead == every[14:]).all()
+
+
+@pytest.mark.parametrize("freq", ["D", "h"])
+def test_an_hour_put_forward_is_no_gap(freq: str) -> None:
+    index = pd.date_range("2024-03-30", periods=60, freq=freq, tz="Europe/Berlin")
+    assert bmc.filter(level(), {"y": pd.Series(np.zeros(60), index=index)}).steps == 60
+
+
+def test_rows_named_as_the_templates_t() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev, t: bmc.Normal(x_prev + t, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    frame = pd.DataFrame({"t": [1, 2, 3], "y": [1.0, 2.0, 3.0]})
+    with pytest.raises(EvidenceError, match="labelled from t = 1 on, and the template reads t"):
+        bmc.filter(dbn, frame)
+    assert bmc.filter(dbn, frame.assign(t=[0, 1, 2])).times.tolist() == [0, 1, 2]
+    assert bmc.filter(level(), frame).steps == 3
+
+
+def test_static_nodes_are_learned_from_a_frame() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("q", bmc.HalfNormal(2.0))
+    dbn.add("x", lambda x_prev, q: bmc.Normal(x_prev, q), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    y = np.cumsum(np.random.default_rng(0).normal(size=20))
+    frame = pd.DataFrame({"y": y}, index=pd.date_range("2020-01-01", periods=20, freq="MS"))
+    assert bmc.fit(dbn, frame)["q"] == pytest.approx(float(bmc.fit(dbn, {"y": y})["q"]))
