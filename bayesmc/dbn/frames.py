@@ -18,7 +18,7 @@ from bayesmc.dbn.slices import TIME, Template
 from bayesmc.errors import EvidenceError
 from bayesmc.network.columns import clock, columns_of, is_dated, is_frame, is_text
 from bayesmc.network.frames import names_of, read_table, with_inputs
-from bayesmc.network.labels import is_default
+from bayesmc.network.labels import is_default, oriented
 
 #: what columns of time are called
 _NAMES = (TIME, "time", "step", "slice", "date", "datetime", "timestamp")
@@ -188,6 +188,7 @@ def _index_of(template: Template, observations: Mapping[str, Any]) -> _Times | N
     """Times that a Series (or a table of one node) in a dict brings along."""
     for name, value in observations.items():
         if name in template.later and name not in template.static and _index(value) is not None:
+            oriented(repr(name), value, template.later[name].plates, template.plates.labels, 1)
             found = _unnamed(repr(name), value)
             if found is not None:
                 _check_order(repr(name), found.instants)
@@ -263,7 +264,7 @@ def _check_indexes(template: Template, observations: Any, inputs: Any) -> None:
 
 
 def _is_told(what: str, template: Template, frame: Any) -> bool:
-    """Whether a column says of which time rows are, or of which element, so that the index does not matter."""
+    """Whether a column says of which time rows are, or of which element, whatever the index."""
     columns = columns_of(frame, what)
     told = _time_column(what, template, columns, None) is not None
     return told or any(p in columns for p in template.plates.sizes)

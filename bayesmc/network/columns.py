@@ -118,6 +118,11 @@ class Labelled:
         """Shape of the numbers."""
         return self.values.shape
 
+    @property
+    def T(self) -> Labelled:  # noqa: N802
+        """The first two axes exchanged."""
+        return Labelled(np.swapaxes(self.values, 0, 1), self.columns, self.index)
+
     def to_numpy(self) -> np.ndarray:
         """The numbers alone."""
         return self.values
