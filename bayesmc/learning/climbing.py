@@ -15,6 +15,9 @@ _TRIED, _CLIMBED = 32, 3
 _RISE = 1e-5
 #: curvature, in nats, below which there is none, and the slope that may be left along such directions
 _FLAT, _SLOPE = 1e-4, 1e-3
+#: information below which numbers are not told, over a step as long as they are; the same of combinations
+#: of them, beside that of each by itself
+_UNTOLD, _SINGULAR = 1e-2, 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +103,40 @@ def curvature(objective: Objective, u: np.ndarray) -> np.ndarray:
         at[1, k] += step
         found[k] = (objective.gradient(at[1]) - objective.gradient(at[0])) / (2 * step)
     return 0.5 * (found + found.T)
+
+
+def told_part(hessian: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The covariance that a curvature says, and groups of numbers that it does not tell.
+
+    Returns
+    -------
+    ndarray, shape (size, size)
+        NaN for what is not told, and everywhere where the curvature is not that of a maximum.
+    list of ndarray
+        Positions: a number alone that the objective is flat in, or several with a flat combination.
+    """
+    size = len(u)
+    covariance = np.full((size, size), np.nan)
+    information = -hessian
+    scale = np.maximum(1.0, np.abs(u))
+    own = np.diagonal(information)
+    with np.errstate(invalid="ignore", over="ignore"):
+        alone = ~(own * scale**2 > _UNTOLD) | ~np.isfinite(information).all(axis=0)
+    groups = [np.array([k]) for k in np.flatnonzero(alone)]
+    rest = np.flatnonzero(~alone)
+    if not len(rest):
+        return covariance, groups
+    unit = 1.0 / np.sqrt(own[rest])
+    values, vectors = np.linalg.eigh(information[np.ix_(rest, rest)] * np.outer(unit, unit))
+    flat = np.abs(values) <= _SINGULAR
+    groups += [rest[np.abs(v) > 1e-2] for v in vectors[:, flat].T]
+    if (values < -_SINGULAR).any():
+        return covariance, groups
+    inner = (vectors[:, ~flat] / values[~flat]) @ vectors[:, ~flat].T * np.outer(unit, unit)
+    lost = (np.abs(vectors[:, flat]) > 1e-2).any(axis=1)
+    inner[lost], inner[:, lost] = np.nan, np.nan
+    covariance[np.ix_(rest, rest)] = inner
+    return covariance, groups
 
 
 # ---- private ------------------------------------------------------------------------------------
