@@ -17,7 +17,9 @@ _RISE = 1e-5
 _FLAT, _SLOPE = 1e-4, 1e-3
 #: information below which numbers are not told, over a step as long as they are; the same of combinations
 #: of them, beside that of each by itself
-_UNTOLD, _SINGULAR = 1e-2, 1e-6
+_UNTOLD, _SINGULAR = 1e-4, 1e-6
+#: nats that the objective must be lower two standard errors away, where a parabola is 2 lower
+_FALL = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +107,11 @@ def curvature(objective: Objective, u: np.ndarray) -> np.ndarray:
     return 0.5 * (found + found.T)
 
 
-def told_part(hessian: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np.ndarray]]:
     """The covariance that a curvature says, and groups of numbers that it does not tell.
+
+    A direction is told where the objective is curved in it, and lower two standard errors away: it is 2 nats
+    lower if it is a parabola, and no lower where it rises for ever.
 
     Returns
     -------
@@ -115,6 +120,7 @@ def told_part(hessian: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, list[np.n
     list of ndarray
         Positions: a number alone that the objective is flat in, or several with a flat combination.
     """
+    u, hessian = found.u, found.hessian
     size = len(u)
     covariance = np.full((size, size), np.nan)
     information = -hessian
@@ -128,12 +134,17 @@ def told_part(hessian: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, list[np.n
         return covariance, groups
     unit = 1.0 / np.sqrt(own[rest])
     values, vectors = np.linalg.eigh(information[np.ix_(rest, rest)] * np.outer(unit, unit))
-    flat = np.abs(values) <= _SINGULAR
-    groups += [rest[np.abs(v) > 1e-2] for v in vectors[:, flat].T]
     if (values < -_SINGULAR).any():
         return covariance, groups
+    flat = values <= _SINGULAR
+    for k in np.flatnonzero(~flat):
+        step = np.zeros(size)
+        step[rest] = 2.0 * unit * vectors[:, k] / np.sqrt(values[k])
+        flat[k] = any(not objective.value(at) < found.value - _FALL for at in (u - step, u + step))
+    takes_part = np.abs(vectors[:, flat]) > 0.1
+    groups += [rest[own] for own in takes_part.T]
     inner = (vectors[:, ~flat] / values[~flat]) @ vectors[:, ~flat].T * np.outer(unit, unit)
-    lost = (np.abs(vectors[:, flat]) > 1e-2).any(axis=1)
+    lost = takes_part.any(axis=1)
     inner[lost], inner[:, lost] = np.nan, np.nan
     covariance[np.ix_(rest, rest)] = inner
     return covariance, groups

@@ -257,8 +257,8 @@ def _check_observed(observed: Mapping[str, Any], prior: bool) -> None:
     if prior or any(seen.mask is None or seen.mask.any() for seen in observed.values()):
         return
     raise EvidenceError(
-        "fit: nothing is observed (no entry of the data has a value), so that every value is as likely as any "
-        "other; give data, or use prior=True for the mode of the prior"
+        "fit: nothing is observed (no entry of the data has a value), so that every value is as likely as "
+        "any other; give data, or use prior=True for the mode of the prior"
     )
 
 
@@ -350,7 +350,7 @@ def _fitted(
     prior: bool,
 ) -> Fit:
     values = unknowns.values(found.u)
-    told, untold = told_part(found.hessian, found.u)
+    told, untold = told_part(objective, found)
     covariance = _covariance(unknowns, found, told)
     spread = np.sqrt(np.diagonal(covariance))
     errors, at = {}, 0

@@ -192,4 +192,3 @@ def test_nothing_observed_is_refused() -> None:
     for net, data in ((counts(), {"count": [None] * 4}), (walk(), {"y": [np.nan] * 3})):
         with pytest.raises(EvidenceError, match="nothing is observed"):
             bmc.fit(net, data)
-    assert bmc.fit(counts(), {"count": [None] * 4}, prior=True)["rate"] == pytest.approx(1.0)
