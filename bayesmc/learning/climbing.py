@@ -137,7 +137,7 @@ def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np
     if (values < -_SINGULAR).any():
         return covariance, groups
     flat = values <= _SINGULAR
-    for k in np.flatnonzero(~flat):
+    for k in np.flatnonzero(~flat) if found.converged else ():
         step = np.zeros(size)
         step[rest] = 2.0 * unit * vectors[:, k] / np.sqrt(values[k])
         flat[k] = any(not objective.value(at) < found.value - _FALL for at in (u - step, u + step))

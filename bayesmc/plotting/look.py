@@ -58,7 +58,9 @@ def check_posterior(answer: Any, what: str) -> None:
         return
     if isinstance(answer, SeriesPosterior):
         particles = getattr(answer, "weight_ess", None) is not None
-        others = ", weights() and, of filters with particles kept, ancestry(name)" if particles else ""
+        others = (
+            ", weights() and, of filters with particles kept, ancestry(name)" if particles else ""
+        )
         raise UnsupportedError(
             f"{what}: a {type(answer).__name__} has beliefs slice by slice; its pictures are bands(name) and "
             f"forecast(ahead, name){others}. For this one ask infer(template, rows), whose numbers are "

@@ -232,7 +232,7 @@ def _range(marginal: Marginal) -> tuple[float, float]:
     """The central part, with some room on both sides."""
     low, high = marginal.bounds(OUTSIDE)
     room = 0.08 * (high - low) or max(abs(low), 1.0) * 1e-2
-    return float(low - room), float(high + room)
+    return max(float(low - room), marginal.ends[0]), min(float(high + room), marginal.ends[1])
 
 
 def _common_range(before: Marginal, after: Marginal) -> tuple[float, float]:
