@@ -40,13 +40,15 @@ def jumps(
     density: UnconstrainedDensity,
     low: np.ndarray | None = None,
     high: np.ndarray | None = None,
+    *,
     above: float = -np.inf,
+    to_zero: bool = False,
 ) -> frozenset[str]:
     """Nodes that move at some values of which the density jumps from one positive value to another.
 
     Found by trying: ``8`` ways for each node, from random points around 0. With ``low`` and ``high``, points
     of free numbers, shape (points, size), ``nodes_that_jump`` looks between these, for jumps beside which or
-    behind which the log density is ``above`` a number.
+    behind which the log density is ``above`` a number; with ``to_zero``, from a positive density to none.
 
     Examples
     --------
@@ -79,10 +81,9 @@ def jumps(
     except UnsupportedError:
         return frozenset()
     if low is not None and high is not None:
-        nodes = density.nodes
-        return frozenset(
-            nodes_that_jump(density.root, FREE, values, nodes, low, high, above=above)
-        )
+        root, nodes = density.root, density.nodes
+        found = nodes_that_jump(root, FREE, values, nodes, low, high, to_zero=to_zero, above=above)
+        return frozenset(found)
     rng = np.random.default_rng(density.size)
     low = _SPREAD * rng.normal(size=(count, density.size))
     high = low.copy()

@@ -14,7 +14,12 @@ from bayesmc.engines.approximate.evidence import log_constants, why_not
 from bayesmc.engines.approximate.free_gaussian import FreeGaussian
 from bayesmc.engines.approximate.modes import Mode, NoMode, modes_of
 from bayesmc.engines.approximate.posterior import DRAWS, ApproximatePosterior
-from bayesmc.engines.approximate.question import free_density, linear_below, refuse_jumps, start_points
+from bayesmc.engines.approximate.question import (
+    free_density,
+    linear_below,
+    refuse_jumps,
+    start_points,
+)
 from bayesmc.engines.base import Engine
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import ConvergenceWarning, UnsupportedError
@@ -162,7 +167,7 @@ class LaplaceApproximation(Engine):
         if not found:
             raise UnsupportedError(_without_mode(density, lost))
         found = sorted(found, key=lambda mode: -mode.log_volume)
-        refuse_jumps(density, found[0], type(self).__name__)
+        refuse_jumps(density, found[0], type(self).__name__, edges=True)
         constant = log_constants(density.target)
         _warn(density, found, lost, constant)
         best = found[0]

@@ -112,9 +112,9 @@ def map(  # noqa: A001 - the name that everybody knows it by
     Raises
     ------
     UnsupportedError
-        A density cannot be followed or has no gradient, or jumps; a hidden node is discrete without finite states, or
-        all are finite; no climb found a mode, with what it met by name (a ridge, a density that rises without
-        end) and how far a step would still have gone.
+        A density cannot be followed or has no gradient, or jumps; a hidden node is discrete without finite
+        states, or all are finite; no climb found a mode, with what it met by name (a ridge, a density that
+        rises without end) and how far a step would still have gone.
 
     Warns
     -----

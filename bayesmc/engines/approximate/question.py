@@ -88,11 +88,12 @@ def start_points(
     return np.unique(found[finite], axis=0) if finite.any() else np.zeros((1, density.size))
 
 
-def refuse_jumps(density: UnconstrainedDensity, mode: Mode, who: str) -> None:
+def refuse_jumps(density: UnconstrainedDensity, mode: Mode, who: str, edges: bool = False) -> None:
     """Refuse a density that jumps around its mode, or on the way from there to where the prior has mass.
 
-    Climbs do not see it: the other side may be higher, and its gradient does not tell. Far from the mode jumps
-    count where the density beside or behind them is not negligible.
+    Climbs do not see it: the other side may be higher, and its gradient does not tell. Far from the mode
+    jumps count where the density beside or behind them is not negligible. With ``edges`` a density is
+    refused, too, that is zero beyond some values near the mode, which a Gaussian there does not know of.
 
     Raises
     ------
@@ -104,8 +105,15 @@ def refuse_jumps(density: UnconstrainedDensity, mode: Mode, who: str) -> None:
     near = mode.u + scipy.linalg.solve_triangular(mode.root.T, z).T
     try:
         _refuse(jumps(density, near, near))
+        cut = jumps(density, near, near, to_zero=True) if edges else ()
+        if cut:
+            raise UnsupportedError(
+                f"the density is zero beyond some values of node {min(cut)!r} near its mode (an observed "
+                "comparison, or bounds that depend on other nodes), where a Gaussian there has mass; use "
+                "ExpectationPropagation, Gibbs or HamiltonianMonteCarlo"
+            )
         least = mode.log_density - _NEGLIGIBLE
-        _refuse(jumps(density, mode.u[None], _drawn(density, _FAR), least))
+        _refuse(jumps(density, mode.u[None], _drawn(density, _FAR), above=least))
     except UnsupportedError as error:
         raise UnsupportedError(f"{who}: {error}") from error
 
@@ -133,8 +141,8 @@ def _made(target: Target, who: str) -> UnconstrainedDensity:
 def _refuse(jumping: frozenset[str]) -> None:
     if jumping:
         raise UnsupportedError(
-            f"the density jumps at some values of node {min(jumping)!r}, so that its curvature tells nothing; "
-            "use Gibbs or MetropolisHastings"
+            f"the density jumps at some values of node {min(jumping)!r}, so that its curvature tells "
+            "nothing; use Gibbs or MetropolisHastings"
         )
 
 

@@ -268,14 +268,14 @@ def _refuse_endless(system: System, names: Sequence[str], wide: np.ndarray) -> N
         at = x.at[x.at >= 0]
         ratio = now[at] / wide[at]
         if (~(ratio > _GONE)).any():
-            k = at[np.argmin(np.where(ratio > _GONE, np.inf, 0.0))]
+            least = now[at][~(ratio > _GONE)][0]
             factors = ", ".join(map(repr, dict.fromkeys(names)))
             raise UnsupportedError(
-                f"ExpectationPropagation: what is believed of node {name!r} narrows without end (its standard "
-                f"deviation has come to {now[k]:.2g}), and factors of {factors} have no integral with it: the "
-                "posterior has no integral, or next to all of its mass at the edge of a support, as a scale "
-                "has whose readings are all equal; give the scale a prior that vanishes at the edge "
-                "(LogNormal, InverseGamma), or the readings the noise of their rounding"
+                f"ExpectationPropagation: what is believed of node {name!r} narrows without end (its "
+                f"standard deviation has come to {least:.2g}), and factors of {factors} have no integral "
+                "with it: the posterior has no integral, or next to all of its mass at the edge of a "
+                "support, as a scale has whose readings are all equal; give the scale a prior that vanishes "
+                "at the edge (LogNormal, InverseGamma), or the readings the noise of their rounding"
             )
 
 
