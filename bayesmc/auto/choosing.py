@@ -12,7 +12,7 @@ from bayesmc.auto.switching import REASON, why_too_long, within_budget
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import asking, is_worth_it
@@ -108,7 +108,8 @@ def engine_for(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked
                 stacklevel=3,
             )
         return chosen.engine
-    reason = checked_engine(engine).refusal(problem)
+    with picks_told(problem.slices, problem.series):
+        reason = checked_engine(engine).refusal(problem)
     if reason is None:
         return engine  # what else it cannot do, its own method says best
     others = [c() for c in _CANDIDATES if not isinstance(engine, c)]
@@ -116,7 +117,7 @@ def engine_for(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked
     unable = [
         f"{type(o).__name__}()"
         for o in (*others, FactoredFrontier())
-        if f"{type(o).__name__}(" in reason and type(o) is not type(engine)
+        if f"{type(o).__name__}()" in reason and type(o) is not type(engine)
         if _why_not(o, problem, asked) is not None
     ]
     if unable:

@@ -16,7 +16,7 @@ from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.calendar import last_times
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, read_queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.paths import Paths, forecast_from
 from bayesmc.engines.propagation.engine import ExpectationPropagation
@@ -288,7 +288,8 @@ def _filtered(
         seed = seed_sequence(None) if opened is None else opened.seed(None)
     found: SeriesPosterior
     if opened is None:
-        found = chosen.filter(problem, seed, **options)
+        with picks_told(problem.slices, problem.series):
+            found = chosen.filter(problem, seed, **options)
         found.times = problem.times
         return found
     file, answer = opened.begin(chosen, seed, options["keep"], {"queries": options["queries"]})
@@ -298,7 +299,8 @@ def _filtered(
         return found
     with closing(file):
         more: dict[str, Any] = {"checkpoint": file} if chosen.saves else {}
-        found = chosen.filter(problem, seed, **options, **more)
+        with picks_told(problem.slices, problem.series):
+            found = chosen.filter(problem, seed, **options, **more)
         found.times = problem.times
         if not chosen.saves and not getattr(found, "interrupted", False):
             file.finish(found)
@@ -329,7 +331,8 @@ def _smoothed(
     if engine is None and isinstance(chosen, ExpectationPropagation):
         return settled_or_kim(chosen, problem, queries, options["progress"])
     given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
-    return chosen.smooth(problem, seed, **given)
+    with picks_told(problem.slices, problem.series):
+        return chosen.smooth(problem, seed, **given)
 
 
 def _from_belief(

@@ -58,8 +58,11 @@ class SeriesProblem:
 
     @cached_property
     def hidden(self) -> tuple[str, ...]:
-        """Nodes of a slice that are not observed in full throughout, parents first; objects apart."""
-        apart = {*self.seen, *self.objects}
+        """Nodes of a slice that are not observed in full throughout, parents first.
+
+        Objects apart, and what is observed and cannot be drawn where it is not.
+        """
+        apart = {*self.seen, *self.objects, *(undrawn(self.slices) & {*self.series.observed})}
         return tuple(n for n in self.slices.dynamic if n not in apart)
 
     @cached_property
@@ -82,6 +85,18 @@ class SeriesProblem:
             if model[n].is_stochastic
             and (n not in self.series.static or self.series.static[n].mask is not None)
         )
+
+
+def undrawn(slices: Slices) -> frozenset[str]:
+    """Nodes without a sampler that nothing reads: where one is not observed, it has no value.
+
+    A density of whole pictures weighs them and cannot draw one; all else can be told without.
+    """
+    models = (slices.first, slices.later)
+    read = {p for model in models for node in model.nodes.values() for p in node.parents}
+    read |= {p for model in models for found, _ in model.potentials.values() for p in found.parents}
+    read |= {*slices.interface}
+    return frozenset(n for n in slices.stochastic if n not in read and slices.first[n].unsampled)
 
 
 def pose_series(

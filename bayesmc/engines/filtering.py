@@ -26,9 +26,11 @@ from bayesmc.dbn import (
 )
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
+from bayesmc.engines.picks import pick_outside
 from bayesmc.engines.refusals import common_refusal
 from bayesmc.errors import (
     BayesmcError,
+    EvidenceError,
     InterruptWarning,
     ModelError,
     QueryError,
@@ -245,7 +247,7 @@ class FilterEngine:
         slices, row = read_row(
             belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
         )
-        with in_slice(row.t):
+        with in_slice(row.t), picks_told(slices, [row]):
             return self._absorbed(belief, slices, row)
 
     def unsupported(
@@ -373,6 +375,17 @@ def in_slice(t: int) -> Iterator[None]:
     except Exception as error:  # somebody else's: its arguments may mean anything
         with suppress(AttributeError):
             error.add_note(f"this was in slice {t}")
+        raise
+
+
+@contextmanager
+def picks_told(slices: Slices, rows: Any) -> Iterator[None]:
+    """Has an index that is outside of a plate say which input of some rows it comes from."""
+    try:
+        yield
+    except IndexError as error:
+        if why := pick_outside(slices, rows):
+            raise EvidenceError(why) from error
         raise
 
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, TIME, Row, Slices
+from bayesmc.dbn import PREVIOUS, TIME, Row, Slices, undrawn
 from bayesmc.distributions import Distribution
 from bayesmc.engines.forward import TableDraw, TableWeigh, table_of
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
@@ -22,7 +22,7 @@ from bayesmc.engines.proposing import proposal_steps
 from bayesmc.engines.slice_program import whole_slice
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.kernels.proposal import Key, Proposal, names_of
-from bayesmc.network import CompiledNode, Model
+from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.forward import (
     Compute,
     Draw,
@@ -30,8 +30,11 @@ from bayesmc.network.forward import (
     Pass,
     Step,
     WeighDrawn,
+    current_distribution,
     nothing,
+    summed,
 )
+from bayesmc.shapes import read_only
 from bayesmc.structure import Table
 
 #: numbers of a node that nothing reads that count as one
@@ -63,6 +66,7 @@ class SlicePlan:
         #: whether densities that can be followed are read, which takes milliseconds, to be evaluated together
         self.is_read = False
         self._kept: dict[Any, list[Step]] = {}
+        self._undrawn = undrawn(slices)
         self._tables: dict[tuple[bool, str], Table | None] = {}
 
     @property
@@ -99,6 +103,11 @@ class SlicePlan:
         table = self._table(row.t == 0, name)
         if table is not None and table.invalid is not None:
             table = None  # its function says at which particle
+        if name in self._undrawn:
+            if seen is None:
+                return Unknown(node)
+            if seen.mask is not None:
+                return WeighSeen(model, node, seen, self.apart)
         if seen is None:
             if table is not None:
                 return TableDraw(node, table)
@@ -305,6 +314,35 @@ class QuickWeigh(Quick):
                 state.weigh(log)
                 return
         self.plain(state)
+
+
+class Unknown:
+    """A hidden node that cannot be drawn and that nothing reads: not a number, the same for all particles."""
+
+    def __init__(self, node: CompiledNode) -> None:
+        self.name, self.value = node.name, read_only(np.full(node.value_shape, np.nan))
+
+    def __call__(self, state: Pass) -> None:
+        state.values[self.name] = self.value
+
+
+class WeighSeen:
+    """The same with some plate elements seen: these weigh, the others are not numbers."""
+
+    def __init__(
+        self, model: Model, node: CompiledNode, seen: Observed, apart: tuple[str, ...]
+    ) -> None:
+        assert seen.mask is not None
+        self.model, self.node, self.seen, self.apart = model, node, seen.value, apart
+        self.elements = seen.mask
+        mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
+        self.value = read_only(np.where(mask, seen.value, np.nan))
+
+    def __call__(self, state: Pass) -> None:
+        dist = current_distribution(self.model, self.node, state, drawn=~self.elements)
+        log = self.model.log_density(self.node.name, dist, self.seen)
+        state.weigh(summed(np.where(self.elements, log, 0.0), self.node, self.apart))
+        state.values[self.node.name] = self.value
 
 
 def quickly(model: Model, node: CompiledNode, kind: type[Quick], plain: Step) -> Step:

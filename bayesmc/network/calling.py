@@ -194,17 +194,17 @@ def call(
         raise ModelError(f"node {name!r}: {_explain(error, arguments)}") from error
 
 
-def to_mix(declaration: Declaration, parents: Sequence[str], plate: str) -> str:
+def to_mix(declaration: Declaration, parents: Sequence[str], plate: str, how: str = "sum") -> str:
     """The lines that mix the elements of a plate, for a node of that plate that does so itself."""
     rest = tuple(p for p in declaration.plates if p != plate)
     plates = f", plates={rest if len(rest) > 1 else rest[0]!r}" if rest else ""
     parent = parents[0] if parents else "x"
-    total = f"{parent}_total"
+    total = f"{parent}_{'total' if how == 'sum' else how}"
     others = ", ".join(dict.fromkeys([*parents, total]))
     return (
         "to mix elements (a mean, a cumulative sum), use an unplated deterministic node that reads the "
-        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.sum({plate!r}){plates}), and read that: "
-        f"lambda {others}: ... in {declaration.name!r}"
+        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.{how}({plate!r}){plates}), and read "
+        f"that: lambda {others}: ... in {declaration.name!r}"
     )
 
 
@@ -340,10 +340,14 @@ def _own_plate_reduced(
     if not (named and shared):
         return None
     plate = declaration.plates[0]
+    code = getattr(declaration.function, "__code__", None)
+    read = code.co_names if code is not None else ()
+    how = next((m for m in read if m in ("sum", "mean", "max", "min", "std", "var", "prod")), "sum")
+    parents = list(dict.fromkeys([*shared, *(n for n, _ in links)]))
     return (
         f"{shared[0]!r} arrives as a plain array, element by element, since {plate!r} is a plate of the "
-        f"node itself, so .sum({plate!r}) has nothing to reduce; "
-        + to_mix(declaration, list(dict.fromkeys(n for n, _ in links)), plate)
+        f"node itself, so .{how}({plate!r}) has nothing to reduce; "
+        + to_mix(declaration, parents, plate, how)
     )
 
 

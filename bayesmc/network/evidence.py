@@ -21,6 +21,7 @@ from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, observed_links
 from bayesmc.shapes import Shape, at_index, first_index
 
+_NO_READING = "put in what stands for no reading (of ranges: robotics.clean_ranges)"
 _ARTICLE = {"deterministic": "a deterministic", "input": "an input", "fixed": "a fixed (do)"}
 _FULL_TURN = 2 * math.pi * (1 + 1e-6)
 #: share of angles beyond a full turn from which on they are no slips, and what degrees do not go beyond
@@ -93,7 +94,7 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
         raise EvidenceError(
             f"evidence on {node.name!r}: of one vector the entry at {at if len(at) > 1 else at[0]} is "
             "missing and others are not, which is not supported; split the vector into nodes of its parts, "
-            "leave all of it out, or put in what stands for no reading (of ranges: robotics.clean_ranges)"
+            f"leave all of it out, or {_NO_READING}"
         )
     if every.all() and array.size:
         return None
@@ -302,6 +303,7 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
             at = first_index(bad)
             raise EvidenceError(
                 f"evidence on {node.name!r} is {stored[at]:g}{at_index(at)}; it must be finite"
+                + (f"; {_NO_READING}" if event else "")
             )
     support = node.support or node.reach
     if node.domain is not None or support is None:

@@ -385,9 +385,10 @@ def _as_index(key: Any, plate: str, size: int) -> PlateArray:
     is_known = not hasattr(held, "within")  # what stands for an index is looked at once it is known
     array: Any = np.asarray(held) if is_known else held
     if array.dtype.kind not in "iu":
+        way = "; give an input of whole numbers, .astype(int)" if array.dtype.kind == "f" else ""
         raise IndexError(
             f"plate {plate!r} is gathered by integers 0..{size - 1} (a discrete parent, an integer or "
-            f"an integer array), not by {array.dtype} values"
+            f"an integer array), not by {array.dtype} values{way}"
         )
     if is_known and array.size:
         low, high = int(array.min()), int(array.max())

@@ -172,8 +172,10 @@ class ChainsPosterior(_Chains, DrawsPosterior):
                 }
                 return new
         raise UnsupportedError(
-            f"relabelled({by!r}): its elements are no components that the model could name otherwise; ask of "
-            "the posterior as it is"
+            f"relabelled({by!r}): its elements are no components that the model could name otherwise; if "
+            "they should be, declare their weights as one Dirichlet with equal concentrations (a Beta and "
+            "its complement are not seen to be alike); or order them in the model, "
+            f"net.potential('ordered', lambda {by}: np.where({by}[0] < {by}[1], 0.0, -np.inf))"
         )
 
     def _behind_still(self, what: Any, values: np.ndarray) -> Any:

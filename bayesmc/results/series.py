@@ -368,7 +368,8 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers, ShownSeries):
         if name not in self._tables and name not in self._means:
             raise UnsupportedError(
                 f"{name!r} is not answered for by this result (answered are {list(self.names)}); inputs and "
-                "static nodes are known, of other nodes of a slice ask with queries={name: function}"
+                "static nodes are known, what has no sampler has no value where it is not observed, and of "
+                "other nodes of a slice ask with queries={name: function}"
             )
         return node
 

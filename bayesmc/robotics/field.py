@@ -21,6 +21,7 @@ from bayesmc.distributions.support import Support, nonnegative, product
 from bayesmc.errors import ModelError, ParameterError, ShapeError
 from bayesmc.robotics.end_points import BLOCK, EndPointTable
 from bayesmc.robotics.grid import OccupancyGrid, as_grid, as_number
+from bayesmc.robotics.laser import check_metres
 from bayesmc.robotics.poses import check_radians
 from bayesmc.shapes import Shape, broadcast_shapes
 
@@ -193,7 +194,8 @@ class FieldScan(Distribution):
     ShapeError
         Poses do not have three components, angles more than one axis, or there is no beam.
     ModelError
-        From ``log_prob``: several poses are all farther off the map than it is wide.
+        From ``log_prob``: several poses are all farther off the map than it is wide, or a scan's readings are
+        all beyond the longest range, and no code for no return.
     """
 
     parameter_ndim = {"pose": 1, "angles": 1}
@@ -246,12 +248,13 @@ class FieldScan(Distribution):
     def _of_scan(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Log densities of one scan from poses, shape ``pose.shape[:-1]``: the hot path."""
         used = (ranges >= 0) & (ranges < self.field.max_range)
+        if not used.any():
+            check_metres("LikelihoodField", ranges, self.field.max_range)
+            return np.zeros(pose.shape[:-1])
         if not used.all():
             ranges, angles = ranges[used], self.angles[used]
         else:
             angles = self.angles
-        if not len(ranges):
-            return np.zeros(pose.shape[:-1])
         table = self.field._table
         rows, outside = table.place(pose.reshape(-1, 3))
         if outside is not None and outside.size > 1 and outside.all():

@@ -7,12 +7,13 @@ afterwards where no beam went. Where a robot is, is not decided here.
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ParameterError
+from bayesmc.errors import EvidenceWarning, ParameterError
 from bayesmc.robotics.grid import as_number
 from bayesmc.robotics.grid_map import FAR, HALO, NEAR, TILE, UNITS, as_maps
 from bayesmc.robotics.laser import Laser, as_scans
@@ -24,6 +25,11 @@ _CAP = 120
 #: maps that are worked on at a time: their cells stay in cache
 _BLOCK = 32
 _CELLS = TILE * TILE
+_NOTHING = (
+    "ScanMapper: a scan without a return was put into a map that is empty, and it stays so: where the robot "
+    "is follows from its motion alone until something is seen; where that is in every scan, see whether "
+    "ranges are in metres and max_range is the laser's"
+)
 #: cells from the origin up to which whole numbers count them
 _FARTHEST = 1e9
 
@@ -109,6 +115,13 @@ class ScanMapper:
         TypeError, ParameterError, ShapeError
             No maps, maps of different resolutions, poses that are not finite, as many ranges as there
             are not beams.
+        ModelError
+            All readings of a scan are beyond the longest range, and no code for no return.
+
+        Warns
+        -----
+        EvidenceWarning
+            A scan without a return comes to a map that is empty.
         """
         maps, pose = as_maps("ScanMapper", maps), as_poses("ScanMapper", pose)
         if not np.isfinite(pose).all():
@@ -142,6 +155,8 @@ class ScanMapper:
         size = maps[0].resolution
         ends, passed = self.laser.ends(ranges), self.laser.passed(ranges, size)
         if not len(ends):
+            if not any(one.tiles for one in maps):
+                warnings.warn(_NOTHING, EvidenceWarning, stacklevel=3)
             return maps
         touched = _Touched(maps, _placed(poses, ends, size), _placed(poses, passed, size))
         old = touched.tiles(maps)

@@ -12,10 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ModelError, ParameterError, ShapeError
 from bayesmc.robotics.grid import as_number
 from bayesmc.robotics.poses import check_radians
 from bayesmc.shapes import owned
+
+#: numbers beyond its longest range with which a range finder may say that nothing came back
+_CODES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +76,18 @@ class Laser:
         check_radians("Laser", "headings of a mount", np.array(mount[2:]))
 
     def returns(self, ranges: np.ndarray) -> np.ndarray:
-        """Which readings are returns, a bool for each."""
+        """Which readings are returns, a bool for each.
+
+        Raises
+        ------
+        ModelError
+            There is none, and the readings beyond ``max_range`` are no code for that: see ``check_metres``.
+        """
         with np.errstate(invalid="ignore"):
-            return np.asarray((ranges > 0) & (ranges < self.max_range))
+            found = np.asarray((ranges > 0) & (ranges < self.max_range))
+        if not found.any():
+            check_metres("Laser", ranges, self.max_range)
+        return found
 
     def ends(self, ranges: Any) -> np.ndarray:
         """End points of one scan's returns in the robot's frame (m), shape (returns, 2)."""
@@ -103,6 +115,26 @@ class Laser:
 
     def __repr__(self) -> str:
         return f"Laser({len(self.angles)} beams, max_range={self.max_range:g})"
+
+
+def check_metres(call: str, ranges: np.ndarray, max_range: float) -> None:
+    """Refuse a scan without a return whose readings are many different ones beyond the longest range.
+
+    What a range finder says where nothing came back is one number, or not finite; ranges in millimetres, or
+    a ``max_range`` that is too short, leave out every return, and the scan would say nothing.
+
+    Raises
+    ------
+    ModelError
+    """
+    with np.errstate(invalid="ignore"):
+        beyond = ranges[(ranges >= max_range) & np.isfinite(ranges)]
+    if len(np.unique(beyond)) > max(_CODES, beyond.size // 4):
+        raise ModelError(
+            f"{call}: of {ranges.size} readings of a scan none is a return: they are {beyond.min():.4g} to "
+            f"{beyond.max():.4g} m, and max_range is {max_range:g} m; are they in millimetres? Give metres, "
+            "or the laser's own max_range"
+        )
 
 
 def as_scans(call: str, laser: Laser, ranges: Any) -> np.ndarray:

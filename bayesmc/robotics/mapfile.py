@@ -122,7 +122,7 @@ def write_map(grid: OccupancyGrid, path: Any, *, mode: str = "trinary") -> Path:
     Raises
     ------
     ParameterError
-        The mode is not known, or ``path`` is that of an image.
+        The mode is not known, ``path`` is that of an image, or its folder does not exist.
     TypeError
         ``grid`` is no OccupancyGrid.
     MissingExtraError
@@ -138,6 +138,11 @@ def write_map(grid: OccupancyGrid, path: Any, *, mode: str = "trinary") -> Path:
     if path.suffix not in (".yaml", ".yml"):
         raise ParameterError(
             f"write_map: path is that of the YAML file, and ends in .yaml; got {path}"
+        )
+    if not path.parent.is_dir():
+        raise ParameterError(
+            f"write_map: there is no folder {path.parent}; make it first: Path({str(path.parent)!r}).mkdir("
+            "parents=True)"
         )
     pixels = _pixels(grid, mode)[:, ::-1].swapaxes(0, 1)
     picture = path.with_suffix(".png")

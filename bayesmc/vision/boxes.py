@@ -23,11 +23,16 @@ from bayesmc.distributions.base import as_float
 from bayesmc.distributions.parameters import as_number
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.expression import as_one_call
+from bayesmc.vision.pictures import check_frame_shape
 
 #: components of a state
 STATE = 6
 #: scores are taken to be at least this far from 0 and 1
 _SURE = 1e-3
+#: what to do with scores that are none
+_LOGISTIC = (
+    ": make one of a margin by a logistic, 1 / (1 + exp(-margin)), fitted where the truth is known"
+)
 
 
 class Scores(NamedTuple):
@@ -58,7 +63,7 @@ def padded(frames: Sequence[Any], most: int | None = None) -> np.ndarray:
     ShapeError
         A frame's detections are not rows of five, or more than ``most``.
     ParameterError
-        One that is not finite, or without width or height.
+        One that is not finite, or without width or height, or with a score that is no probability.
 
     Examples
     --------
@@ -80,6 +85,7 @@ def padded(frames: Sequence[Any], most: int | None = None) -> np.ndarray:
             raise ParameterError(
                 f"padded: a detection of frame {k} is not finite, or has no width or height"
             )
+        _probabilities(f"padded: of frame {k}", "scores", row[:, 4], _LOGISTIC)
     needed = max([1, *map(len, rows)])
     most = needed if most is None else most
     if needed > most:
@@ -105,6 +111,8 @@ def iou(one: Any, other: Any) -> np.ndarray:
     [[0.333]]
     """
     a, b = as_float(one)[:, None], as_float(other)[None]
+    if not (a[..., 2:4] >= 0).all() or not (b[..., 2:4] >= 0).all():
+        raise ParameterError("iou: a width or height is negative, or NaN; boxes go by their middle")
     shared = 1.0
     for axis in (0, 1):
         high = np.minimum(a[..., axis] + a[..., axis + 2] / 2, b[..., axis] + b[..., axis + 2] / 2)
@@ -223,7 +231,7 @@ class BoxDetections:
     Parameters
     ----------
     frame_shape : tuple of int
-        (height, width, ...): clutter lies anywhere in it.
+        (height, width) or (height, width, 3): clutter lies anywhere in it.
     detected : float
         Between 0 and 1, both excluded.
     place : float
@@ -236,7 +244,9 @@ class BoxDetections:
     Raises
     ------
     ParameterError
-        A number out of range.
+        A number out of range; from ``given`` and ``log_prob``, ``free`` or scores that are no probabilities.
+    ShapeError
+        ``frame_shape`` is no frame's.
 
     References
     ----------
@@ -252,6 +262,8 @@ class BoxDetections:
     clutter: float = 1.0
 
     def __post_init__(self) -> None:
+        shape = check_frame_shape("BoxDetections", self.frame_shape)
+        object.__setattr__(self, "frame_shape", shape)
         for name in ("place", "size", "clutter"):
             if not 0 < as_number(getattr(self, name)) < math.inf:
                 raise ParameterError(
@@ -271,6 +283,7 @@ class BoxDetections:
         box : array_like, shape (..., 6)
         present : array_like of bool, shape (...)
         free : array_like, shape (..., most)
+            Between 0 and 1.
 
         Returns
         -------
@@ -280,12 +293,14 @@ class BoxDetections:
         box, present, free = (
             _states("BoxDetections.given", box),
             np.asarray(present),
-            as_float(free),
+            _probabilities("BoxDetections.given:", "free", as_float(free)),
         )
         most = free.shape[-1]
         batch = np.broadcast_shapes(box.shape[:-1], present.shape, free.shape[:-1])
 
         def log_prob(seen: np.ndarray) -> np.ndarray:
+            scores = np.where(seen[..., 2] > 0, seen[..., 4], 0.0)
+            _probabilities("BoxDetections:", "scores", scores, _LOGISTIC)
             ratio = (free * self.ratios(box, seen)).sum(axis=-1)
             return np.log(np.where(present != 0, 1 - self.detected + ratio, 1.0))
 
@@ -347,7 +362,7 @@ def boosted(
         Of states (..., 6) with independent components: ``BoxMotion().given(box_prev)``, or where boxes begin.
     seen : array_like, shape (..., most, 5)
     free : array_like, shape (..., most)
-        Weights of the boxes; 0 leaves one out.
+        Weights of the boxes, between 0 and 1; 0 leaves one out.
     place, size : float
         Standard deviations about a box: of its middle, as a share of its height, and of its log sizes.
     share : float
@@ -356,7 +371,7 @@ def boosted(
     Raises
     ------
     ParameterError
-        ``share`` is not in 0..1, 1 excluded.
+        ``share`` is not in 0..1, 1 excluded; ``free`` or scores that are no probabilities.
 
     References
     ----------
@@ -380,7 +395,9 @@ def boosted(
         )
     seen, free = as_float(seen), as_float(free)
     there = seen[..., 2] > 0
-    weights = np.where(there, free * seen[..., 4], 0.0)
+    scores = np.where(there, seen[..., 4], 0.0)
+    _probabilities("boosted:", "scores", scores, _LOGISTIC)
+    weights = np.where(there, _probabilities("boosted:", "free", free) * scores, 0.0)
     weights = share * weights / np.maximum(weights.sum(axis=-1, keepdims=True), 1.0)
     rest = 1 - weights.sum(axis=-1, keepdims=True)
     mean, spread = as_float(prior.mean)[..., None, :], np.sqrt(prior.var)[..., None, :]
@@ -407,6 +424,20 @@ def boosted(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _probabilities(what: str, name: str, values: np.ndarray, way: str = "") -> np.ndarray:
+    """Values that are all between 0 and 1.
+
+    Raises
+    ------
+    ParameterError
+    """
+    low, high = values.min(initial=0.0), values.max(initial=1.0)
+    if not (low >= 0 and high <= 1):  # NaN, too
+        off = values[~((values >= 0) & (values <= 1))].flat[0]
+        raise ParameterError(f"{what} {name} are probabilities, between 0 and 1; got {off:g}{way}")
+    return values
 
 
 def _states(what: str, box: Any) -> np.ndarray:

@@ -117,11 +117,23 @@ class Contour:
         angle : float
             By which the first semi-axis is turned from +x towards +y (clockwise on the screen), in rad.
         control : int
+
+        Raises
+        ------
+        ShapeError
+            The centre or the semi-axes are no pair of numbers.
+        ParameterError
+            A semi-axis is not positive, or a number not finite.
         """
+        middle, axes = _pair("center", center), _pair("semi_axes", semi_axes)
+        if not (axes > 0).all():
+            raise ParameterError(
+                f"Contour.ellipse: semi_axes must be positive (px); got {semi_axes!r:.60}"
+            )
         turn = np.linspace(0, 2 * np.pi, 20 * control, endpoint=False)
-        x, y = np.cos(turn) * semi_axes[0], np.sin(turn) * semi_axes[1]
+        x, y = np.cos(turn) * axes[0], np.sin(turn) * axes[1]
         c, s = np.cos(angle), np.sin(angle)
-        points = np.stack([c * x - s * y, s * x + c * y], axis=-1) + as_float(center)
+        points = np.stack([c * x - s * y, s * x + c * y], axis=-1) + middle
         basis = _basis(control, turn / (2 * np.pi), True)
         return cls(np.linalg.lstsq(basis, points, rcond=None)[0])
 
@@ -232,15 +244,23 @@ class ShapeSpace:
 
     def lines(self, state: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Points along the outlines of states and unit normals there, both shape (..., count, 2)."""
+        points, normals, _ = self._lines(state, count)
+        return points, normals
+
+    def _lines(self, state: Any, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """And how far apart they are, over how far on the template, (..., count)."""
         state = self._checked(state)
         at, along = self.template._at(count)
         apart = at @ self.template.control - self.template.center
         turned = np.swapaxes(self._matrix(state), -1, -2)
         points = apart @ turned + (state[..., :2] + self.template.center)[..., None, :]
-        tangents = (along @ self.template.control) @ turned
+        directions = along @ self.template.control
+        tangents = directions @ turned
         normals = np.stack([tangents[..., 1], -tangents[..., 0]], axis=-1)
-        length = np.sqrt(np.vecdot(normals, normals))[..., None]
-        return points, normals / np.where(length > 0, length, 1.0)
+        length = np.sqrt(np.vecdot(normals, normals))
+        normals /= np.where(length > 0, length, 1.0)[..., None]
+        own = np.hypot(*directions.T)
+        return points, normals, length / np.where(own > 0, own, 1.0)
 
     def basis(self, count: int) -> np.ndarray:
         """How points along the outline move with the state, shape (count, 2, size): linear throughout."""
@@ -287,6 +307,17 @@ class ShapeSpace:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _pair(name: str, value: Any) -> np.ndarray:
+    found = as_float(value)
+    if found.shape != (2,):
+        raise ShapeError(
+            f"Contour.ellipse: {name} is {value!r:.60}; give a pair of numbers in px, such as (20.0, 30.0)"
+        )
+    if not np.isfinite(found).all():
+        raise ParameterError(f"Contour.ellipse: {name} must be finite; got {value!r:.60}")
+    return found
 
 
 def _basis(control: int, places: np.ndarray, closed: bool, derivative: int = 0) -> np.ndarray:

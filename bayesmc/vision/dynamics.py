@@ -100,8 +100,10 @@ class SecondOrder:
         ------
         ParameterError
             Noise that is not positive, or damping outside 0..1.
+        ShapeError
+            Another number of components than ``size``.
         """
-        scale = np.broadcast_to(as_float(noise), (size,))
+        scale, middle = _vector("noise", noise, size), _vector("mean", mean, size)
         if not (scale > 0).all() or not np.isfinite(scale).all():
             raise ParameterError(f"SecondOrder.steady: noise must be positive; got {noise!r:.60}")
         if not 0 <= as_number(damping) <= 1:
@@ -109,7 +111,6 @@ class SecondOrder:
                 f"SecondOrder.steady: damping must lie in 0..1; got {damping!r:.60}"
             )
         unit = np.eye(size)
-        middle = np.broadcast_to(as_float(mean), (size,))
         return cls(middle, (2 - damping) * unit, (damping - 1) * unit, np.diag(scale))
 
     @property
@@ -221,6 +222,16 @@ def fit_dynamics(states: Any, prior: float = 60.0) -> SecondOrder:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _vector(name: str, value: Any, size: int) -> np.ndarray:
+    found = as_float(value)
+    if found.shape not in ((), (1,), (size,)):
+        raise ShapeError(
+            f"SecondOrder.steady: {name} has shape {found.shape}; give one number, or {size}: one for each "
+            "component"
+        )
+    return np.broadcast_to(found, (size,))
 
 
 def _about(

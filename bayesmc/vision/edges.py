@@ -8,15 +8,17 @@ comes out is a ratio: the density of the features with the thing there over that
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
+from scipy.special import ndtr
 
 from bayesmc.distributions.base import as_float
 from bayesmc.distributions.parameters import as_number
-from bayesmc.errors import ParameterError
+from bayesmc.errors import ModelError, ModelMisfitWarning, ParameterError
 from bayesmc.expression import as_one_call
 from bayesmc.shapes import Shape
 from bayesmc.vision.contours import ShapeSpace
@@ -26,6 +28,8 @@ from bayesmc.vision.pictures import Kept, OfFrame, check_frame_shape, grey
 _AT_ONCE = 1 << 18
 #: features per px of a picture without any
 _LEAST_CLUTTER = 1e-3
+#: stands for no change at all along an axis
+_NO_STEP = 1e-12
 
 #: fields with a margin of one px and their width; the least change that is a feature; features per px
 _Prepared = tuple[tuple[np.ndarray, np.ndarray, int], float, float]
@@ -38,11 +42,17 @@ class ContourEdges:
     On each of ``lines`` normals, ``reach`` px to both sides, features are the places where the frame changes
     most along the normal. With features at distances ``v_j`` from the outline a normal counts::
 
-        missed + (1 - missed) / clutter * sum_j Normal(v_j; 0, sigma)
+        1 - (1 - missed) * seen + (1 - missed) / clutter * sum_j Normal(v_j; 0, sigma)
 
     which is the density of what was found over that of clutter alone: features of clutter come as a Poisson
-    process of rate ``clutter``, and the outline gives one, at most. The log density is the sum of the
-    logarithms over the normals, times ``tempering``. Where an outline leaves the frame it counts as missed.
+    process of rate ``clutter``, and the outline gives one, at most. ``seen`` is the probability that this one
+    lies where it is looked for: the mass of the normal density over that part of the line which is within
+    ``reach`` and in the frame. In the middle of a frame it is 1, all but. A line outside the frame was not
+    searched, and counts 1: it says neither that the outline is there nor that it is not. So outlines of
+    which different parts are in the frame compare with each other, and with one that is out of sight, whose
+    log density is 0. The log density is the sum of the logarithms over the normals, times ``tempering``.
+    Where normals are closer together than on the template they see one edge several times: what they find (a
+    logarithm above 0) counts by how close they are, and what they miss counts in full.
 
     Parameters
     ----------
@@ -56,7 +66,7 @@ class ContourEdges:
     lines : int
         Normals, at even steps along the template; by default one every five px.
     missed : float
-        Probability that a normal has no feature of the outline, between 0 and 1, both excluded.
+        Probability that the outline gives no feature on a normal, between 0 and 1, both excluded.
     clutter : float, optional
         Features of clutter per px of a normal. By default those on the frame's own rows and columns.
     contrast : float
@@ -73,11 +83,19 @@ class ContourEdges:
         A number out of range.
     ShapeError
         ``frame_shape`` is no frame's.
+    ModelError
+        From ``log_prob``: several outlines are all farther off the frame than it is wide.
+
+    Warns
+    -----
+    ModelMisfitWarning
+        From ``log_prob``: of several outlines none is in sight, so that the frame weighs all the same.
 
     References
     ----------
     Isard and Blake (1998), CONDENSATION: conditional density propagation for visual tracking, IJCV 29,
-    section 4.3 (one normal, with ``alpha = missed * clutter / (1 - missed)``) and 4.4.
+    section 4.3 (one normal, with ``alpha = missed * clutter / (1 - missed)``) and 4.4. That ``seen`` is below
+    1 where a line is cut off follows from their generative model, of which they have whole lines only.
 
     Examples
     --------
@@ -167,12 +185,13 @@ class ContourEdges:
         contours, IJCV 11.
         """
         state = self.space._checked(state)
-        found, offsets = self._features(self._fields(as_float(frame)), state[None])
+        prepared, lines = self._fields(as_float(frame)), int(self.lines or 0)
+        found, offsets = self._features(prepared, *self.space.lines(state[None], lines))
         apart = np.where(found[0], np.abs(offsets), np.inf)
         at = apart.argmin(axis=-1)
         moved = np.where(np.isfinite(apart.min(axis=-1)), offsets[at], np.nan)
-        _, normals = self.space.lines(state, int(self.lines or 0))
-        rows = np.einsum("li,lis->ls", normals, self.space.basis(int(self.lines or 0)))
+        _, normals = self.space.lines(state, lines)
+        rows = np.einsum("li,lis->ls", normals, self.space.basis(lines))
         return rows, rows @ state + moved
 
     # ---- private -------------------------------------------------------------------------------
@@ -180,18 +199,80 @@ class ContourEdges:
     def _score(self, frame: np.ndarray, states: np.ndarray) -> np.ndarray:
         prepared, lines = self._fields(frame), int(self.lines or 0)
         rate = prepared[2] if self.clutter is None else self.clutter
-        log = np.empty(len(states))
-        step = max(1, _AT_ONCE // (lines * (2 * int(self.reach or 0) + 1)))
+        log, in_sight, there = np.empty(len(states)), False, np.float32(1 - self.missed)
+        step = max(1, _AT_ONCE // (lines * (2 * self._reach + 1)))
         for start in range(0, len(states), step):
             part = slice(start, start + step)
-            found, offsets = self._features(prepared, states[part])
+            points, normals, share = self.space._lines(states[part], lines)
+            found, offsets = self._features(prepared, points, normals)
             near = np.exp(-0.5 * (offsets / self.sigma) ** 2) / (
                 math.sqrt(2 * math.pi) * self.sigma
             )
-            near = near.astype(np.float32)
-            ratio = self.missed + (1 - self.missed) / rate * (found.astype(np.float32) @ near)
-            log[part] = np.log(ratio).sum(axis=-1)
+            near = (near / rate).astype(np.float32)
+            seen = self._seen(points, normals)
+            in_sight |= bool(seen.any())
+            ratio = 1 + there * (found.astype(np.float32) @ near - seen)
+            each = np.log(ratio)
+            log[part] = np.where(each > 0, each * np.minimum(share, 1.0), each).sum(axis=-1)
+        if not in_sight and len(states) > 1:
+            self._out_of_sight(states)
         return self.tempering * log
+
+    @property
+    def _reach(self) -> int:
+        """Whole px of a normal to either side."""
+        return int(np.ceil(float(self.reach or 0)))
+
+    def _seen(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Probability that the outline's own feature lies where it would be found, (n, lines).
+
+        Found is what stands out from both neighbours along the normal, so these are in the frame, too.
+        """
+        height, width = self.frame_shape[:2]
+        whole = np.float32(2 * ndtr((self._reach + 0.5) / self.sigma) - 1)
+        margin = self._reach + 2
+        x, y = points[..., 0], points[..., 1]
+        if (
+            x.min(initial=margin) >= margin
+            and y.min(initial=margin) >= margin
+            and x.max(initial=0) <= width - 1 - margin
+            and y.max(initial=0) <= height - 1 - margin
+        ):
+            return np.broadcast_to(whole, x.shape)
+        low, high = np.full(x.shape, -np.inf), np.full(x.shape, np.inf)
+        for axis, size in ((0, width), (1, height)):
+            step = normals[..., axis]
+            step = np.where(np.abs(step) < _NO_STEP, _NO_STEP, step)
+            with np.errstate(over="ignore"):
+                one, other = ((end - points[..., axis]) / step for end in (-0.5, size - 0.5))
+            np.maximum(low, np.minimum(one, other), out=low)
+            np.minimum(high, np.maximum(one, other), out=high)
+        first = np.clip(np.ceil(low + 1), -self._reach, self._reach + 1)
+        last = np.clip(np.floor(high - 1), -self._reach - 1, self._reach)
+        mass = ndtr((last + 0.5) / self.sigma) - ndtr((first - 0.5) / self.sigma)
+        return np.where(last >= first, mass, 0.0).astype(np.float32)
+
+    def _out_of_sight(self, states: np.ndarray) -> None:
+        """Say that no outline is in sight; so far off that none can have meant it, refuse."""
+        height, width = self.frame_shape[:2]
+        points, _ = self.space.lines(states, int(self.lines or 0))
+        x, y = points[..., 0], points[..., 1]
+        away = float(
+            np.maximum(np.maximum(-x, x - width + 1), np.maximum(-y, y - height + 1)).min()
+        )
+        if away > max(self._reach, math.hypot(width, height)):
+            raise ModelError(
+                f"ContourEdges: all of {len(states)} outlines are {away:.3g} px or more off the picture, "
+                f"which spans x 0 to {width - 1} and y 0 to {height - 1} px; no normal reaches that far: is "
+                "the start given in pixels, as (x, y), and where the template is?"
+            )
+        warnings.warn(
+            "ContourEdges: none of several outlines is in the picture, so that a frame weighs all of them "
+            "the same: where they are is what their dynamics say. It may be that the thing has left; it is "
+            "found again if some outline goes where it comes back",
+            ModelMisfitWarning,
+            stacklevel=2,
+        )
 
     def _prepared(self, frame: np.ndarray) -> _Prepared:
         """Changes of brightness to the right and down, what is a feature, and how many there are per px."""
@@ -205,12 +286,13 @@ class ContourEdges:
         )
         return (right.ravel(), down.ravel(), right.shape[1]), least, rate
 
-    def _features(self, prepared: _Prepared, states: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where on the normals of states there are features, (n, lines, offsets), and the offsets in px."""
+    def _features(
+        self, prepared: _Prepared, points: np.ndarray, normals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where on normals (n, lines, 2) there are features, (n, lines, offsets), and the offsets in px."""
         (right, down, width), least, _ = prepared
-        reach = int(np.ceil(float(self.reach or 0)))
-        offsets = np.arange(-reach - 1.0, reach + 2.0)  # one more at either end, to tell peaks
-        points, normals = self.space.lines(states, int(self.lines or 0))
+        # one more at either end, to tell peaks
+        offsets = np.arange(-self._reach - 1.0, self._reach + 2.0)
         nx, ny = (normals[..., None, axis].astype(np.float32) for axis in (0, 1))
         along = offsets.astype(np.float32)
         height = len(right) // width

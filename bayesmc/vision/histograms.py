@@ -17,6 +17,8 @@ from bayesmc.vision.pictures import Kept, OfFrame, check_frame_shape
 
 #: colours with less saturation or value than this have no hue to speak of
 _FAINT = 0.1
+#: values may be above white by this factor, of noise
+_OVER = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class Histograms:
     Parameters
     ----------
     frame_shape : tuple of int
-        (height, width) or (height, width, 3): 0..255.
+        (height, width) or (height, width, 3).
     reference : array_like, shape (cells,), optional
         Histogram of the thing, such as ``of`` gives it; needed for ``given``.
     bins : int
@@ -39,11 +41,14 @@ class Histograms:
         The greater, the more a difference counts.
     background : float
         ``d^2`` of a box of background.
+    white : float
+        The largest value that a frame can have: 255, 1 of frames in 0..1, 65535 of 16 bits.
 
     Raises
     ------
     ParameterError
-        A number out of range.
+        A number out of range. From ``of`` and ``log_prob``: values of a frame are beyond ``white``, or so
+        small against it that all are in one bin; frames of zeros are dark, and taken.
     ShapeError
         The reference has another number of cells.
 
@@ -70,6 +75,7 @@ class Histograms:
     bins: int = 8
     sharpness: float = 20.0
     background: float = 0.5
+    white: float = 255.0
     _cells: Kept = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -83,6 +89,10 @@ class Histograms:
         if not 0 < as_number(self.sharpness) < math.inf:
             raise ParameterError(
                 f"Histograms: sharpness must be positive; got {self.sharpness!r:.60}"
+            )
+        if not 0 < as_number(self.white) < math.inf:
+            raise ParameterError(
+                f"Histograms: white must be positive and finite; got {self.white!r:.60}"
             )
         if not 0 <= as_number(self.background) <= 1:
             raise ParameterError(
@@ -121,12 +131,19 @@ class Histograms:
         ------
         ShapeError
             The frame has another shape.
+        ParameterError
+            A box has no size, or the frame's values are of another range than ``white`` says.
         """
         frame, boxes = as_float(frame), as_float(boxes)
         if frame.shape != self.frame_shape:
             raise ShapeError(
                 f"Histograms: the frame has shape {frame.shape}, not {self.frame_shape}"
             )
+        if not (boxes[..., 2:4] > 0).all():
+            raise ParameterError(
+                "Histograms.of: a box has no width or height; give (x, y, width, height)"
+            )
+        self._check_levels(frame, whole=True)
         return self._shares(frame, boxes)
 
     @as_one_call
@@ -177,23 +194,39 @@ class Histograms:
 
     def _counted(self, frame: np.ndarray) -> np.ndarray:
         """Integral histogram (Porikli 2005): counts of each cell above and to the left of a pixel."""
+        self._check_levels(frame)
         height, width = self.frame_shape[:2]
         found = np.zeros((height + 1, width + 1, self.cells))
         which = self._cell_of(frame)
         found[1:, 1:] = which[..., None] == np.arange(self.cells)
         return found.cumsum(axis=0, out=found).cumsum(axis=1, out=found)
 
+    def _check_levels(self, frame: np.ndarray, whole: bool = False) -> None:
+        """Refuse values of another range; whole numbers may be those of a frame that is nearly dark."""
+        high = float(frame.max())
+        if high > _OVER * self.white:
+            raise ParameterError(
+                f"Histograms: a frame has values up to {high:g}, and white={self.white:g}: all above would "
+                "be in one bin; say what white is (white=65535 of 16 bits, 4095 of 12), or scale the frames"
+            )
+        dark = 0 < high <= self.white / 255
+        if dark and (whole or (frame != np.rint(frame)).any()):
+            raise ParameterError(
+                f"Histograms: a frame has no values above {high:g}, and white={self.white:g}: all would be "
+                "in one bin; say white=1 of frames in 0..1, or scale the frames"
+            )
+
     def _cell_of(self, frame: np.ndarray) -> np.ndarray:
         def binned(share: np.ndarray) -> np.ndarray:
             return np.clip((share * self.bins).astype(np.intp), 0, self.bins - 1)
 
         if frame.ndim == 2:
-            return binned(frame / 256.0)
+            return binned(frame * (255.0 / 256.0 / self.white))
         try:
             from skimage.color import rgb2hsv
         except ImportError:
             raise missing_extra("scikit-image", "vision") from None
-        hue, saturation, value = np.moveaxis(rgb2hsv(np.clip(frame / 255.0, 0, 1)), -1, 0)
+        hue, saturation, value = np.moveaxis(rgb2hsv(np.clip(frame / self.white, 0, 1)), -1, 0)
         coloured = (saturation > _FAINT) & (value > _FAINT)
         return np.where(
             coloured, binned(hue) * self.bins + binned(saturation), self.bins**2 + binned(value)

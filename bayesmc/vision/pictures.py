@@ -100,6 +100,11 @@ class OfFrame(Density):
         ``score(frame, states)``: log densities, shape (n,), of one frame at states of shape (n, size).
     states : ndarray, shape (..., size)
     frame_shape : tuple of int
+
+    Raises
+    ------
+    ParameterError
+        A state is not finite.
     """
 
     def __init__(
@@ -110,6 +115,9 @@ class OfFrame(Density):
     ) -> None:
         self._score, self.states = score, states
         super().__init__(self._of, event_shape=frame_shape, batch_shape=states.shape[:-1])
+        if not np.isfinite(np.add.reduce(states, axis=None)):  # cheaper than every element
+            ok = np.isfinite(states).all(axis=-1)
+            self.states = self._check("states", states, ok, 0.0, "finite")
 
     def parameters(self) -> list[tuple[np.ndarray, int]]:
         return [(self.states, 1)]

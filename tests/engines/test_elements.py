@@ -118,8 +118,8 @@ def robots(rng: np.random.Generator) -> tuple[Any, ...]:
 
 
 def bent(rng: np.random.Generator) -> tuple[Any, ...]:
-    """Ranges and bearings of landmarks that are roughly known."""
-    dbn = slam([2.0, 0.5], 0.5, looks=2)
+    """Ranges and bearings of landmarks that are known so well that tangents hold."""
+    dbn = slam([2.0, 0.5], 0.05, looks=2)
     which = np.array([rng.permutation(MARKS)[:2] for _ in range(STEPS)])
     rows = np.stack(
         [2 + 0.2 * rng.normal(size=(STEPS, 2)), 0.2 + 0.1 * rng.normal(size=(STEPS, 2))], -1

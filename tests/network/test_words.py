@@ -9,7 +9,7 @@ import bayesmc as bmc
 from bayesmc.errors import BayesmcError, BroadcastError, PlateError
 
 SHOWN = re.compile(
-    r"(net\.add\('\w+', lambda \w+: \w+\.sum\('\w+'\).*?\)), and read that: (lambda [\w, ]+):"
+    r"(net\.add\('\w+', lambda \w+: \w+\.(?:sum|mean)\('\w+'\).*?\)), and read that: (lambda [\w, ]+):"
 )
 
 
@@ -39,10 +39,12 @@ def test_sum_over_an_own_plate_shows_lines_that_run(plates, total, kind):
     if kind is BroadcastError and len(plates) > 1:
         line = line.replace(line.split("sum('")[1].split("'")[0], plates[0])  # whichever it names
     exec(line, {"net": net})
-    net.add("y", eval(f"{signature}: bmc.Normal(x + x_total, 1.0)", {"bmc": bmc}), plates=plates)
+    mixed = re.search(r"add\('(\w+)'", line).group(1)
+    net.add("y", eval(f"{signature}: bmc.Normal(x + {mixed}, 1.0)", {"bmc": bmc}), plates=plates)
     drawn = net.sample(2, rng=0)
-    axis = 1 + plates.index(re.search(r"sum\('(\w+)'\)", line).group(1))
-    assert drawn["x_total"] == pytest.approx(drawn["x"].sum(axis=axis))
+    how, plate = re.search(r"\.(sum|mean)\('(\w+)'\)", line).groups()
+    assert (how == "mean") == ("mean" in total.__code__.co_names)
+    assert drawn[mixed] == pytest.approx(getattr(drawn["x"], how)(axis=1 + plates.index(plate)))
 
 
 def test_ungathered_parent_is_named():

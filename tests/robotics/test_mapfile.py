@@ -134,6 +134,8 @@ def test_writing_refuses(tmp_path: Path):
         write_map(some_grid(), tmp_path / "m.yaml", mode="grey")
     with pytest.raises(ParameterError, match="ends in .yaml"):
         write_map(some_grid(), tmp_path / "m.png")
+    with pytest.raises(ParameterError, match="there is no folder .*nowhere; make it first"):
+        write_map(some_grid(), tmp_path / "nowhere" / "m.yaml")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -8,10 +8,17 @@ import pickle
 import numpy as np
 import pytest
 
-from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
+from bayesmc.errors import (
+    EvidenceWarning,
+    ModelError,
+    ParameterError,
+    ShapeError,
+    UnsupportedError,
+)
 from bayesmc.robotics import (
     GridMap,
     Laser,
+    LikelihoodField,
     MapField,
     OccupancyGrid,
     PoseNormal,
@@ -201,6 +208,26 @@ def test_scans_without_a_hit_leave_the_motion() -> None:
         np.testing.assert_allclose(found.cov, 1.2 * wheels.cov)
         assert MapField(LASER).given([2.0, 2.0, 0.3], one).log_prob(nothing) == 0.0
         assert ScanMapper(LASER).updated(one, [2.0, 2.0, 0.3], nothing)[()] is one
+
+
+def test_scans_that_can_be_no_metres_are_told() -> None:
+    """Readings beyond the longest range that differ are no code for no return; one number is."""
+    one, _ = shared()
+    pose, mapper = np.array([2.0, 2.0, 0.3]), ScanMapper(LASER)
+    millimetres = 1000.0 * scan(pose, world())
+    wheels = PoseNormal(pose, scale_diag=[0.1, 0.2, 0.05])
+    for ask in (
+        lambda: mapper.updated(one, pose, millimetres),
+        lambda: MapField(LASER).given(pose, one).log_prob(millimetres),
+        lambda: ScanMatcher(MapField(LASER)).given(wheels, one, millimetres),
+        lambda: LikelihoodField(world(), max_range=12.0).given(pose, ANGLES).log_prob(millimetres),
+    ):
+        with pytest.raises(ModelError, match="none is a return.*millimetres"):
+            ask()
+    codes = np.where(np.arange(72) % 2, 12.0, 81.9)
+    assert mapper.updated(one, pose, codes)[()] is one
+    with pytest.warns(EvidenceWarning, match="without a return was put into a map that is empty"):
+        assert not mapper.updated(GridMap(0.05), pose, codes)[()].tiles
 
 
 def test_bad_input_is_refused_by_name() -> None:

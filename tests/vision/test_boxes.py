@@ -52,6 +52,38 @@ def test_rows_are_filled_up_and_faults_are_named() -> None:
         padded([[[1.0, 2.0, 3.0, 4.0, 0.5]] * 2], most=1)
 
 
+def test_scores_and_shares_that_are_no_probabilities_are_refused() -> None:
+    state, motion = [50.0, 40.0, 2.0, 3.0, 0.0, 0.0], BoxMotion()
+    for score in (90.0, -1.0):
+        row = [[10.0, 20.0, 4.0, 8.0, score]]
+        with pytest.raises(ParameterError, match=r"frame 1 scores .* got .*logistic"):
+            padded([[], row])
+        with pytest.raises(ParameterError, match="BoxDetections: scores"):
+            BoxDetections(SHAPE).given(state, True, [1.0]).log_prob(row)
+        with pytest.raises(ParameterError, match="boosted: scores"):
+            boosted(motion.given(state), row, [1.0])
+    good = [[10.0, 20.0, 4.0, 8.0, 1.0]]
+    for free in (2.0, -1.0, np.nan):
+        with pytest.raises(ParameterError, match="given: free are probabilities"):
+            BoxDetections(SHAPE).given(state, True, [free])
+        with pytest.raises(ParameterError, match="boosted: free are probabilities"):
+            boosted(motion.given(state), good, [free])
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("box", lambda box_prev: motion.given(box_prev), initial=motion.given(state))
+    dbn.add("boxes", lambda box: BoxDetections(SHAPE).given(box, True, np.ones(1)))
+    dbn.validate()
+
+
+def test_boxes_and_frames_without_a_size_are_refused() -> None:
+    for shape in ((160,), (0, 0)):
+        with pytest.raises(ShapeError, match="BoxDetections: frame_shape"):
+            BoxDetections(shape)
+    with pytest.raises(ParameterError, match="negative"):
+        iou([[0.0, 0.0, 2.0, 2.0]], [[0.0, 0.0, -2.0, 2.0]])
+    with pytest.raises(ParameterError, match="no width or height"):
+        Histograms((20, 30)).of(np.full((20, 30), 9.0), [5.0, 5.0, 0.0, 4.0])
+
+
 def test_detections_weigh_as_one_thing_in_clutter() -> None:
     reads = BoxDetections(SHAPE, detected=0.9, place=0.05, size=0.1, clutter=2.0)
     state = np.array([50.0, 40.0, np.log(10.0), np.log(20.0), 0.0, 0.0])
@@ -196,6 +228,25 @@ def test_histograms_count_pixels_and_frames_that_do_not_fit_are_refused() -> Non
     known = Histograms(frame.shape, counted, bins=4)
     state = [9.5, 14.5, np.log(10.0), np.log(6.0), 0.0, 0.0]
     np.testing.assert_allclose(known.given(state, [1, 0]).log_prob(frame), [10.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("white", [1.0, 255.0, 65535.0])
+def test_histograms_go_by_what_white_is(white: float) -> None:
+    """Frames of other ranges answer as those in 0..255 do, and not with one bin for all pixels."""
+    frame = np.linspace(0, 255, 600).reshape(20, 30)
+    box, scaled = [12.0, 9.0, 8.0, 8.0], frame * white / 255
+    plain = Histograms(frame.shape).of(frame, box)
+    np.testing.assert_allclose(Histograms(frame.shape, white=white).of(scaled, box), plain)
+    other = Histograms(frame.shape, plain, white=255.0 if white != 255 else 1.0)
+    state = [12.0, 9.0, 2.0, 2.0, 0.0, 0.0]
+    for ask in (lambda: other.of(scaled, box), lambda: other.given(state).log_prob(scaled)):
+        with pytest.raises(ParameterError, match="white="):
+            ask()
+    dark = Histograms(frame.shape, plain).given(state)
+    assert np.isfinite(dark.log_prob(np.zeros(frame.shape)))
+    assert np.isfinite(dark.log_prob(np.eye(20, 30)))  # whole numbers, all but dark
+    with pytest.raises(ParameterError, match="white must be positive"):
+        Histograms(frame.shape, white=0.0)
 
 
 def test_colours_are_told_apart_that_are_one_grey() -> None:

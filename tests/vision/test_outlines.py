@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 import bayesmc as bmc
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ModelError, ModelMisfitWarning, ParameterError, ShapeError
 from bayesmc.vision import (
     Contour,
     ContourEdges,
@@ -85,6 +86,14 @@ def test_contours_that_are_none_are_refused() -> None:
             Contour(control)
     with pytest.raises(ParameterError, match="one spot"):
         Contour(np.ones((5, 2)))
+    for axes in (3, (1.0, 2.0, 3.0)):
+        with pytest.raises(ShapeError, match="semi_axes is .* a pair of numbers"):
+            Contour.ellipse((0.0, 0.0), axes)
+    for axes in ((3.0, 0.0), (-3.0, 2.0)):
+        with pytest.raises(ParameterError, match="semi_axes must be positive"):
+            Contour.ellipse((0.0, 0.0), axes)
+    with pytest.raises(ParameterError, match="center must be finite"):
+        Contour.ellipse((0.0, np.nan), (3.0, 3.0))
     with pytest.raises(ParameterError, match="'affine'"):
         ShapeSpace(CIRCLE, "projective")
     with pytest.raises(ShapeError, match="6 components"):
@@ -115,6 +124,8 @@ def test_dynamics_that_cannot_be_learned_are_refused() -> None:
         fit_dynamics(np.zeros((20, 2)))
     with pytest.raises(ParameterError, match="damping"):
         SecondOrder.steady(2, 1.0, damping=2.0)
+    with pytest.raises(ShapeError, match=r"noise has shape \(2,\); give one number, or 6"):
+        SecondOrder.steady(6, noise=[1.0, 2.0])
     running = 1.2 ** np.arange(30)[:, None] + 0.1 * np.random.default_rng(0).normal(size=(30, 1))
     assert fit_dynamics(running).is_stable  # and does not run away
 
@@ -140,33 +151,76 @@ def test_one_normal_counts_as_isard_and_blake_say() -> None:
     assert ((both[0] - 1e-4 <= found) & (found <= both[1] + 1e-4)).all()
 
 
+def test_a_normal_that_is_cut_off_counts_for_what_of_it_is_in_the_frame() -> None:
+    """Blank frames: the density is the probability of finding nothing, in closed form, and 1 outside."""
+    line = Contour([[0.0, 2.0], [0.0, 8.0], [0.0, 12.0], [0.0, 18.0]], closed=False)
+    edges = ContourEdges(
+        ShapeSpace(line, "translation"), (21, 61), sigma=3.0, reach=12.0, lines=1, missed=0.2,
+        tempering=1.0,
+    )  # fmt: skip
+    at = np.array([30.0, 55.0, 59.0, 62.0, 71.0, 72.0, 90.0, -4.0])
+    found = edges.given(np.stack([at, np.zeros(8)], axis=-1)).log_prob(np.full((21, 61), 9.0))
+    # what is found stands out from both its neighbours, so it lies in columns 1 to 59
+    low, high = np.maximum(0.5 - at, -12.5) / 3, np.minimum(59.5 - at, 12.5) / 3
+    seen = np.maximum(ndtr(high) - ndtr(low), 0.0)
+    np.testing.assert_allclose(found, np.log(1 - 0.8 * seen), atol=1e-5)
+    assert seen[2] > 0.5 and found[-2] == 0.0  # searched in part, and not at all
+
+
+def test_an_outline_that_is_half_out_is_found_there_and_not_squeezed_into_the_frame() -> None:
+    """Between truth and outlines inside, and one along what can be seen of it, which has more normals."""
+    disc_at = disc(78.0)
+    edges = ContourEdges(ShapeSpace(CIRCLE, "affine"), (60, 80))
+    squeezed = [[dx, 0.0, 38.0 - dx - 15.0 + grown, 0.0, 0.0, 0.0]
+                for dx in (26.0, 29.0, 32.0, 35.0) for grown in (-2.0, 0.0, 2.0)]  # fmt: skip
+    states = np.array(
+        [[38.0, 0, 0, 0, 0, 0], *squeezed, [28.0, 0, 0, 0, 0, 0], [70.0, 0, 0, 0, 0, 0]]
+    )
+    log = edges.given(states).log_prob(disc_at)
+    assert log[0] > log[1:].max() + 0.5 and log[-1] == 0.0
+
+
 def test_the_density_peaks_at_the_outline_and_blank_frames_say_nothing() -> None:
     edges = ContourEdges(ShapeSpace(CIRCLE, "translation"), (60, 80))
     x, y = np.meshgrid(np.arange(-12.0, 13.0), np.arange(-12.0, 13.0))
-    log = edges.given(np.stack([x, y], axis=-1)).log_prob(disc(44.0, 27.0))
+    states = np.stack([x, y], axis=-1)
+    log = edges.given(states).log_prob(disc(44.0, 27.0))
     best = np.unravel_index(log.argmax(), log.shape)
     assert abs(x[best] - 4) <= 1 and abs(y[best] + 3) <= 1
-    blank = edges.given(np.stack([x, y], axis=-1)).log_prob(np.full((60, 80), 7.0))
+    blank = edges.given(states[9:-9, 9:-9]).log_prob(np.full((60, 80), 7.0))  # all of it inside
     assert np.isfinite(blank).all() and np.ptp(blank) < 1e-4
 
 
-def test_a_contour_off_the_frame_is_missed_and_nothing_is_lost() -> None:
-    """No hypothesis outside is better than a blank one inside, and the filter comes back."""
+def test_a_contour_off_the_frame_weighs_nothing_and_nothing_is_lost() -> None:
+    """Out of sight is as likely as the frame without the thing, and the filter comes back."""
     edges = ContourEdges(ShapeSpace(CIRCLE, "translation"), (60, 80))
-    log = edges.given([[0.0, 0.0], [60.0, 0.0], [1e6, -1e6]]).log_prob(disc())
-    assert log[0] > 0 > log[1] and np.isfinite(log).all()
-    np.testing.assert_allclose(
-        log[2], edges.tempering * edges.lines * np.log(edges.missed), rtol=1e-5
-    )
+    log = edges.given([[0.0, 0.0], [-20.0, 0.0], [75.0, 0.0], [1e6, -1e6]]).log_prob(disc())
+    assert log[0] > 0 > log[1] and log[2] == log[3] == 0.0
     dbn = bmc.DynamicBayesNet()
     dbn.add("shape", lambda shape_prev: bmc.MvNormal(shape_prev, scale_diag=[5.0, 5.0]),
             initial=bmc.MvNormal([0.0, 0.0], scale_diag=[1.0, 1.0]))  # fmt: skip
     dbn.add("frame", lambda shape: edges.given(shape))
-    places = [40.0, 60.0, 80.0, 105.0, 105.0, 80.0, 60.0, 50.0, 44.0, 40.0]  # out and back
-    frames = as_frames([disc(x) for x in places])
+    places = np.array([40, 48, 56, 64, 72, 80, 88, 96, 104, 104, 96, 88, 80, 72, 64, 56.0])
+    frames = as_frames([disc(x) for x in places])  # out and back
     with np.errstate(all="raise"):
-        found = bmc.filter(dbn, {"frame": frames}, engine=bmc.ParticleFilter(1500), rng=0)
-    assert np.abs(found.mean("shape")[-1]).max() < 3.0
+        found = bmc.filter(dbn, {"frame": frames}, engine=bmc.ParticleFilter(600), rng=0)
+    off = found.mean("shape") - np.stack([places - 40.0, np.zeros(16)], axis=-1)
+    inside = np.flatnonzero(places < 85)  # up to half of it out
+    assert np.abs(off[inside]).max() < 3.0, off
+    gone = slice(8, 10)
+    assert (found.mean("shape")[gone, 0] > 50.0).all() and (found.std("shape")[gone, 0] > 4.0).all()
+
+
+def test_contours_that_are_all_out_of_sight_are_told() -> None:
+    space = ShapeSpace(Contour.ellipse((500.0, 400.0), (15.0, 15.0)), "translation")
+    edges = ContourEdges(space, (60, 80))
+    with pytest.raises(ModelError, match=r"all of 3 outlines are 4\d\d px or more off the picture"):
+        edges.given(np.zeros((3, 2))).log_prob(disc())
+    with pytest.warns(ModelMisfitWarning, match="none of several outlines is in the picture"):
+        near = edges.given(np.zeros((3, 2)) + [-350.0, -300.0]).log_prob(disc())
+    assert (near == 0.0).all()
+    with pytest.raises(ParameterError, match="states must be finite"):
+        edges.given([[0.0, np.nan], [0.0, 0.0]])
 
 
 def test_frames_stand_in_plates_and_in_blocks() -> None:

@@ -50,6 +50,8 @@ def marginal_step(
     elements = elements_of(slices, split, asked)
     if elements is None:
         return MarginalStep(*given)
+    if engine.delay and (why := _joint_tangents(engine, slices, split, "delay=")):
+        raise UnsupportedError(why)
     guided = None
     if asked is None:
         guided, is_wrong = guided_node(slices, split, elements)
@@ -179,10 +181,10 @@ def not_of_the_past(engine: Any, problem: SeriesProblem, what: str) -> str | Non
     if what not in PAST:
         return None
     try:
-        split_of_problem(asking(engine, what), problem)
+        split = split_of_problem(asking(engine, what), problem)
     except UnsupportedError as error:
         return f"ParticleFilter: {error}"
-    return None
+    return None if split is None else _joint_tangents(engine, problem.slices, split, what)
 
 
 def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:
@@ -196,6 +198,8 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         return f"ParticleFilter: {error}"
     if split is None:
         return None
+    if engine.delay and (joint := _joint_tangents(engine, problem.slices, split, "delay=")):
+        return joint
     if split.tables is not None:
         try:
             refuse_seen_in_part(split.tables, problem.series.observed)
@@ -208,6 +212,14 @@ def why_not(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
         if elements is not None and not guided_node(slices, split, elements)[1]:
             return None
         wrong = next((n for n in sampled if slices.later[n].domain is None), None)
+        if wrong is not None and elements is not None:
+            found = {n: why_not_guided(slices, elements, n) for n in sampled}
+            whys = [f"{n!r} {why or 'is one of several'}" for n, why in found.items()]
+            return (
+                'ParticleFilter: with marginalize=, proposal="optimal" draws one vector given the row, which '
+                f"readings of {elements.states[0]!r} read, and what is sampled here is not that: "
+                f"{'; '.join(whys)}; give proposal={{...}}, or leave it out"
+            )
         if wrong is not None:
             why = "which is sampled"
             if wrong in problem.series.observed:
@@ -351,6 +363,22 @@ def effort_told(engine: Any, problem: SeriesProblem) -> str:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _joint_tangents(engine: Any, slices: Slices, split: Split, what: str) -> str | None:
+    """Why slices that lie back are not asked about where elements are made linear one by one, or None."""
+    elements = elements_asked(engine, slices, split)
+    if elements is None or not any(g.bent for groups in elements.groups for g in groups):
+        return None
+    name = elements.states[0]
+    count = math.prod(slices.first[name].plate_shape)
+    asked = {"smooth": "smoothing", "fixed-lag": "lag="}.get(what, what)
+    return (
+        f"ParticleFilter: {asked} would make all {count} elements of {name!r} linear together, at the "
+        "mean of their prior, and not each where its readings place it, as filter does; where that prior is "
+        "vague they would be placed anywhere. Ask filter without delay=, follow belief.ancestors for the way "
+        "that was taken, or give marginalize=None"
+    )
 
 
 def _whole(

@@ -382,13 +382,24 @@ def _memory(draws: np.ndarray) -> np.ndarray:
     third = length // 3
     first, last = scores[..., :third].mean(axis=-1), scores[..., -third:].mean(axis=-1)
     with np.errstate(all="ignore"):
-        first, last = (m - m.mean(axis=1, keepdims=True) for m in (first, last))
-        together = (first * last).mean(axis=1)
-        correlation = together / (first.std(axis=1) * last.std(axis=1))
-        z = np.arctanh(correlation) * math.sqrt(chains - 3)
+        correlation, together = _going_together(first, last)
         lasting = together / scores.var(axis=(1, 2))
+        # one chain that met a rare state twice says nothing of the others
+        most = np.argmax(
+            (first - first.mean(1, keepdims=True)) * (last - last.mean(1, keepdims=True)), axis=1
+        )
+        rest = np.arange(chains) != most[:, None]
+        without, _ = _going_together(first[rest].reshape(count, -1), last[rest].reshape(count, -1))
+        z = np.arctanh(np.minimum(correlation, without)) * math.sqrt(chains - 4)
     found = (z > scipy.special.ndtri(1 - _ALARM)) & (lasting > _LASTING)
     return np.where(found, correlation, 0.0)
+
+
+def _going_together(first: np.ndarray, last: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Correlation and covariance over chains, each of shape (scalars, chains)."""
+    first, last = (m - m.mean(axis=1, keepdims=True) for m in (first, last))
+    together = (first * last).mean(axis=1)
+    return together / (first.std(axis=1) * last.std(axis=1)), together
 
 
 def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:

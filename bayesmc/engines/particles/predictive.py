@@ -72,8 +72,9 @@ class Replicates:
         self.names = tuple(problem.series.observed)
         self._wide = _numbers_seen(problem) >= WIDE
         self._looked, self._until = _chosen(problem, self._wide, rng, most), -1
-        # what is without noise has no density to be judged by
-        self._cannot = any(problem.slices.model(t)[n].noiseless for n in self.names for t in (0, 1))
+        # what is without noise has no density to be judged by, and what has no sampler makes no row
+        nodes = [problem.slices.model(t)[n] for n in self.names for t in (0, 1)]
+        self._cannot = any(node.noiseless or node.unsampled for node in nodes)
         self._broken = ""
         self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)

@@ -158,7 +158,8 @@ class ElementStep(MarginalStep):
         """Values of all nodes that are wanted, those of elements once somebody looks at them."""
         plan = self.plan_of_elements
         seen = {n for n, o in row.seen.items() if o.mask is None}
-        missing = [n for n in self.slices.dynamic if n in plan.readings and n not in seen]
+        late = plan.readings | set(() if self.guide is None else self.guide.beside.others)
+        missing = [n for n in self.slices.dynamic if n in late and n not in seen]
         names = [n for n in (*plan.states, *missing) if n in self.kept]
         seed, slices = int(rng.integers(1 << 62)), self.slices
         every = {**known.values, **values}

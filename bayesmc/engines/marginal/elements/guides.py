@@ -22,6 +22,7 @@ from bayesmc.dbn import Row, Slices
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.kalman.slices import covariance_root
 from bayesmc.engines.marginal.elements.beliefs import ElementBeliefs
+from bayesmc.engines.marginal.elements.beside import Beside
 from bayesmc.engines.marginal.elements.plan import ElementPlan, Group, descendants
 from bayesmc.engines.marginal.elements.pool import Pool
 from bayesmc.engines.marginal.elements.rows import GroupRow, Looking
@@ -46,9 +47,10 @@ def why_not_guided(slices: Slices, elements: ElementPlan, name: str) -> str | No
             return "has more than one angle"
         below = descendants(slices, model, {name})
         late = elements.late
-        other = next((n for n in below if model[n].is_stochastic and n not in late), None)
+        others = [n for n in below if model[n].is_stochastic and n not in late]
+        other = next((n for n in others if _goes_on(slices, model, n)), None)
         if other is not None:
-            return f"is read by {other!r}, which is sampled"
+            return f"is read by {other!r}, which other nodes read"
         if below & set(elements.states):
             return f"is read by {elements.states[0]!r}, which is integrated out"
         looks = [look for g in elements.groups[0 if first else 1] for look in g.looks]
@@ -65,6 +67,13 @@ def why_not_guided(slices: Slices, elements: ElementPlan, name: str) -> str | No
         except (TraceError, BayesmcError, AttributeError, NotImplementedError) as error:
             return f"has no derivative, or no moments, that are known ({error})"
     return None
+
+
+def read_beside(slices: Slices, elements: ElementPlan, name: str) -> list[str]:
+    """Stochastic nodes below a guided one that are no readings of elements: they wait until it is drawn."""
+    found = {n for m in (slices.first, slices.later) for n in descendants(slices, m, {name})
+             if m[n].is_stochastic and n not in elements.late}  # fmt: skip
+    return [n for n in slices.dynamic if n in found]
 
 
 class Gaussian(NamedTuple):
@@ -92,8 +101,9 @@ class Guide:
             for n in descendants(slices, model, {name})
             if not model[n].is_stochastic
         }
-        #: nodes that steps of a slice leave out: it, and what is computed from it
-        self.waiting = frozenset(below | {name})
+        self.beside = Beside(slices, name, read_beside(slices, elements.plan, name))
+        #: nodes that steps of a slice leave out: it, what is computed from it, and what else reads it
+        self.waiting = frozenset(below | {name, *self.beside.others})
 
     def drawn(
         self, row: Row, known: Known, before: ElementBeliefs | None, rng: np.random.Generator
@@ -110,19 +120,21 @@ class Guide:
         prior = _moments(own, node, n)
         angles = np.zeros(node.event_shape, bool) if node.angles is None else node.angles
         angles = np.broadcast_to(angles, node.event_shape).reshape(-1)
-        found = self._told(row, known, before, prior, angles)
+        told = self._told(row, known, before, prior, angles)
         is_plain = rng.random(n) < DEFENCE
-        guided = found.mean + np.matvec(found.root, rng.standard_normal(found.mean.shape))
+        guided = told.mean + np.matvec(told.root, rng.standard_normal(told.mean.shape))
         plain = own.sample_to(rng, (n, *node.plate_shape)).reshape(n, -1)
         flat = np.where(is_plain[:, None], plain, guided)
         flat = np.where(angles, wrap_angle(flat), flat)
         value = flat.reshape(n, *node.event_shape)
         log_p = np.broadcast_to(model.log_density(self.name, own, value), (n,))
         log_q = np.logaddexp(
-            math.log1p(-DEFENCE) + _log_density(found, flat, angles), math.log(DEFENCE) + log_p
+            math.log1p(-DEFENCE) + _log_density(told, flat, angles), math.log(DEFENCE) + log_p
         )
         value.flags.writeable = False
-        return log_p - log_q, self._with_computed(row, known, {self.name: value})
+        found = self._with_computed(row, known, {self.name: value})
+        more = self.beside.log(row, with_more(known, found))
+        return log_p - log_q + more, found
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -133,7 +145,8 @@ class Guide:
         model, every, found = self.slices.model(row.t), {**known.values, **values}, dict(values)
         for name in model.nodes:
             late = name in self.elements.plan.below
-            if name in self.waiting and name != self.name and not late:
+            beside = name == self.name or name in self.beside.others
+            if name in self.waiting and not beside and not late:
                 found[name] = every[name] = model.evaluate(name, every)[0]
         return found
 
@@ -159,7 +172,7 @@ class Guide:
             if not k:
                 picks = self._picked(row, here, pool, prior)
             here = with_more(here, picks)
-            rows = [r for r in self._rows(row, here, pool) if r is not None]
+            rows = [*self._rows(row, here, pool), *self.beside.rows(row, here)]
             if not rows:
                 return prior
             seen = np.concatenate([r[0] for r in rows], axis=1) @ prior.root
@@ -259,6 +272,12 @@ class Guide:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _goes_on(slices: Slices, model: Any, name: str) -> bool:
+    """Whether other stochastic nodes, of this slice or the next, read a node."""
+    below = descendants(slices, model, {name})
+    return name in slices.interface or any(model[n].is_stochastic for n in below)
 
 
 def _moments(own: Any, node: Any, count: int) -> Gaussian:

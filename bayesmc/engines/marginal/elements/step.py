@@ -23,16 +23,11 @@ from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.kalman.data import given_values, pattern_of
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.elements.beliefs import ElementBeliefs
+from bayesmc.engines.marginal.elements.places import linearised
 from bayesmc.engines.marginal.elements.plan import ElementPlan, Group
 from bayesmc.engines.marginal.elements.pool import Pool
 from bayesmc.engines.marginal.elements.rows import GroupRow, Looking, present_in
-from bayesmc.engines.marginal.elements.updates import (
-    Belief,
-    Tangent,
-    conditioned,
-    linearised,
-    log_predictive,
-)
+from bayesmc.engines.marginal.elements.updates import Belief, Tangent
 from bayesmc.engines.marginal.gaussians import Gaussians, nothing, take_in
 from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.tables.step import Known
@@ -226,8 +221,8 @@ class ElementFilter:
                     found.slopes[none[some]] = 0.0
                 return found
 
-            made, rows = linearised(prior, data.of(reading), tangent, group.bent)
-            after, own = conditioned(prior, rows, made)
+            made = linearised(prior, data.of(reading), tangent, group.bent)
+            after, own = made.conditioned(prior)
             pool = put(after)
             np.add.at(
                 log, (which, np.broadcast_to(self.group[at], (n, len(readings))).reshape(-1)), own
@@ -271,9 +266,9 @@ class ElementFilter:
                     return found
 
                 given = data.of(np.full(len(possible), r))
-                made, rows = linearised(some, given, tangent, group.bent)
+                made = linearised(some, given, tangent, group.bent)
                 flat = joint.reshape(-1)
-                flat[possible] += log_predictive(some, rows, made)
+                flat[possible] += made.log_predictive(some)
                 joint = flat.reshape(own.shape)
             level = log_sum_exp(joint, axis=1)
             np.add.at(log, (np.arange(n), self.group[at[:, 0]]), level)
@@ -284,8 +279,7 @@ class ElementFilter:
                 back = np.searchsorted(possible, flat)
                 back = np.minimum(back, len(possible) - 1)
                 own_prior = Belief(prior.mean[flat], prior.root[flat])
-                kept = Tangent(*(part[back] for part in made))
-                after, _ = conditioned(own_prior, rows.of(back), kept)
+                after, _ = made.of(back).conditioned(own_prior)
                 gone = level == -np.inf
                 after = Belief(
                     np.where(gone[:, None], own_prior.mean, after.mean),

@@ -1,10 +1,10 @@
 """Gaussian beliefs about single elements conditioned on what picks them, many at a time.
 
 Means of readings are made linear at the mean of the belief, as the extended Kalman filter does. Where the
-belief is so vague that this says little about where it ends up (a landmark met for the first time), the
-tangent misses the reading at the updated mean; then it is taken at the mode instead, found by Gauss and
-Newton: the iterated extended Kalman filter, which is Laplace's method. So a first sight is placed by what is
-read, whatever the prior mean is.
+belief is so vague that such a tangent does not hold over what it leaves of the belief (a landmark met for the
+first time), it is taken at the mode instead, found by Gauss and Newton: the iterated extended Kalman filter,
+which is Laplace's method. So a first sight is placed by what is read, whatever the prior mean is. Where the
+tangent at the mode does not hold, either, ``places`` goes on.
 
 References
 ----------
@@ -26,8 +26,13 @@ from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.means import absorbed
 from bayesmc.linalg.square_root import condition_many
 
-#: standard deviations of the noise that a tangent may miss a reading by at the updated mean
-_MISSED = 3.0
+#: standard deviations of the noise that a tangent may be off by, and those of what it leaves of a belief
+#: at which it is tried
+HELD, _ENDS = 0.5, 1.5
+#: standard deviations of the noise that a tangent may change by along one of the belief
+_STEEP = 1e6
+#: how nearly readings without noise are met
+_EXACT = 1e-6
 #: steps of Gauss and Newton, halvings of each, and the length, in standard deviations, of a step that is none
 _STEPS, _HALVINGS, _SETTLED = 60, 10, 1e-3
 #: share of what a reading is off that a tangent may miss along a step
@@ -82,36 +87,40 @@ def expected_at(prior: Belief, point: np.ndarray, found: Tangent) -> Tangent:
     return found._replace(mean=found.mean + moved)
 
 
-def linearised(prior: Belief, row: Row, at: At, bent: bool) -> tuple[Tangent, Row]:
-    """The tangent that a belief is conditioned by, with what it expects at the belief's mean; and the row.
+def plain(prior: Belief, row: Row, at: At) -> tuple[Tangent, Row]:
+    """Tangents at means of beliefs; angles of the row are turned so that they are off the short way round."""
+    found = at(prior.mean, np.arange(len(prior.mean)))
+    return found, row.turned(found.mean)
 
-    Angles of the row are turned so that they are off the short way round from where the tangent is taken.
+
+def placed(prior: Belief, row: Row, at: At) -> tuple[Tangent, Row, np.ndarray]:
+    """Tangents at means of beliefs, or at modes where those do not hold; the row; whether tangents hold.
+
+    What tangents expect is at the means of the beliefs.
     """
-    every = np.arange(len(prior.mean))
-    found = at(prior.mean, every)
-    plain = row.turned(found.mean)
-    if not bent:
-        return found, plain
-    finite = np.isfinite(found.mean).all(axis=-1) & np.isfinite(found.slopes).all(axis=(-2, -1))
-    tame = _masked(found, finite)
-    sizes = np.abs(np.diagonal(found.noise, 0, -2, -1))
-    new = _updated(prior, row, tame)
-    missed = at(new, every).mean - tame.mean - np.matvec(tame.slopes, new - prior.mean)
-    missed = np.where(row.angles, wrap_angle(missed), missed)
-    is_off = ~(np.abs(missed) <= _MISSED * sizes) & row.present
-    again = np.flatnonzero((is_off.any(axis=-1) | ~finite) & row.present.any(axis=-1))
+    found, turned = plain(prior, row, at)
+    holds = _holds(prior, row, turned, found, at)
+    again = np.flatnonzero(~holds)
     if not len(again):
-        return found, plain
-    some = Belief(prior.mean[again], prior.root[again])
-    point = _mode(some, row.of(again), lambda x, which: at(x, again[which]))
-    tangent = at(point, again)
-    there = expected_at(some, point, tangent)
-    value = np.array(plain.value)
-    value[again] = row.of(again).turned(tangent.mean).value
+        return found, turned, holds
+    some, own = Belief(prior.mean[again], prior.root[again]), row.of(again)
+
+    def at_some(x: np.ndarray, which: np.ndarray) -> Tangent:
+        return at(x, again[which])
+
+    point = some.mean + np.matvec(some.root, mode(some, own, at_some))
+    there = at_some(point, np.arange(len(again)))
+    smooth = is_smooth(there, some.root)
+    tangent = _masked(there, smooth)
+    turned_there = own.turned(tangent.mean)
+    tangent = expected_at(some, point, tangent)
+    holds[again] = smooth & _holds(some, own, turned_there, tangent, at_some)
+    value = np.array(turned.value)
+    value[again] = turned_there.value
     parts = [np.array(a) for a in found]
-    for whole, own in zip(parts, there, strict=True):
-        whole[again] = own
-    return Tangent(*parts), plain._replace(value=value)
+    for whole, part in zip(parts, tangent, strict=True):
+        whole[again] = part
+    return Tangent(*parts), turned._replace(value=value), holds
 
 
 def conditioned(prior: Belief, row: Row, found: Tangent) -> tuple[Belief, np.ndarray]:
@@ -152,6 +161,75 @@ def log_predictive(prior: Belief, row: Row, found: Tangent) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
+def seen_root(noise: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Roots of covariances of what is there, with 1 for what is not."""
+    if present.all():
+        return noise
+    both = present[..., :, None] & present[..., None, :]
+    covariance = noise @ np.matrix_transpose(noise)
+    return np.linalg.cholesky(np.where(both, covariance, np.eye(present.shape[-1])))
+
+
+def whitened(noise: np.ndarray, off: np.ndarray, present: np.ndarray) -> np.ndarray:
+    """Numbers (batch, p) or slopes (batch, p, k) in units of the noise; 0 for what is not there."""
+    is_flat = off.ndim == 2
+    wide = np.where(present[..., None], off[..., None] if is_flat else off, 0.0)
+    found = np.linalg.solve(seen_root(noise, present), wide)
+    return found[..., 0] if is_flat else found
+
+
+def is_smooth(found: Tangent, root: np.ndarray) -> np.ndarray:
+    """Where there is a tangent: none is where a reading turns within nothing, as a bearing at no range."""
+    steep = np.abs(found.slopes @ root).max(axis=(-2, -1), initial=0.0)
+    finite = np.isfinite(found.mean).all(axis=-1) & np.isfinite(steep)
+    sizes = np.abs(np.diagonal(found.noise, 0, -2, -1)).min(axis=-1)
+    return finite & (np.where(finite, steep, 0.0) <= _STEEP * np.where(sizes > 0, sizes, np.inf))
+
+
+def _holds(prior: Belief, row: Row, turned: Row, found: Tangent, at: At) -> np.ndarray:
+    """Whether tangents hold over what they leave of beliefs: at both ends of it, for readings and slopes."""
+    every = np.arange(len(prior.mean))
+    holds = is_smooth(found, prior.root) | ~row.present.any(axis=-1)
+    if not np.diagonal(found.noise, 0, -2, -1).all():
+        return _meets(prior, row, turned, found, at)
+    tame = _masked(found, holds)
+    scaled = whitened(tame.noise, tame.slopes @ prior.root, row.present)
+    off = whitened(tame.noise, turned.off(tame.mean), row.present)
+    across = np.matrix_transpose(scaled)
+    lower = np.linalg.cholesky(across @ scaled + np.eye(scaled.shape[-1]))
+    own = np.matrix_transpose(np.linalg.inv(lower))
+    new = np.matvec(own @ np.matrix_transpose(own), np.matvec(across, off))
+    root = prior.root @ own
+    for side in (_ENDS, -_ENDS):
+        move = np.matvec(prior.root, new) + side * root.sum(axis=-1)
+        made = at(prior.mean + move, every)
+        missed = made.mean - tame.mean - np.matvec(tame.slopes, move)
+        missed = np.where(row.angles, wrap_angle(missed), missed)
+        missed = whitened(tame.noise, missed, row.present)
+        bent = whitened(tame.noise, (made.slopes - tame.slopes) @ root, row.present)
+        holds &= (np.abs(missed) <= HELD).all(axis=-1)
+        holds &= np.square(bent).sum(axis=(-2, -1)) <= HELD**2
+    return holds | ~row.present.any(axis=-1)
+
+
+def _meets(prior: Belief, row: Row, turned: Row, found: Tangent, at: At) -> np.ndarray:
+    """The same where a reading has no noise: whether it is met."""
+    smooth = np.isfinite(found.mean).all(axis=-1) & np.isfinite(found.slopes).all(axis=(-2, -1))
+    new = conditioned(prior, turned, _masked(found, smooth))[0].mean
+    off = row.off(at(new, np.arange(len(new))).mean)
+    return smooth & (np.abs(off) <= _EXACT * (1 + np.abs(row.value))).all(axis=-1)
+
+
+def _floored(found: Tangent, root: np.ndarray) -> Tangent:
+    """With a little noise where there is none, to be near to what is read."""
+    sizes = np.diagonal(found.noise, 0, -2, -1)
+    if sizes.all():
+        return found
+    steep = np.nan_to_num(np.abs(found.slopes @ root).max(axis=-1))
+    more = np.where(sizes == 0, _EXACT * steep + 1e-300, 0.0)
+    return found._replace(noise=found.noise + more[..., None] * np.eye(more.shape[-1]))
+
+
 def _masked(found: Tangent, finite: np.ndarray) -> Tangent:
     return Tangent(
         np.where(finite[:, None], found.mean, 0.0),
@@ -171,28 +249,19 @@ def _step(prior: Belief, row: Row, point: np.ndarray, found: Tangent) -> np.ndar
     return np.linalg.solve(turned @ scaled + np.eye(n), np.matvec(turned, off)[..., None])[..., 0]
 
 
-def _updated(prior: Belief, row: Row, found: Tangent) -> np.ndarray:
-    """Means given the row."""
-    noise = found.noise
-    if not np.diagonal(noise, 0, -2, -1).all():
-        return conditioned(prior, row, found)[0].mean
-    step = _step(prior, row, np.zeros_like(prior.mean), found)
-    return prior.mean + np.matvec(prior.root, step)
-
-
-def _mode(prior: Belief, row: Row, at: At) -> np.ndarray:
-    """Modes of beliefs given rows, shape (batch, n), from where the prior is and places around it."""
+def mode(prior: Belief, row: Row, at: At) -> np.ndarray:
+    """Modes of beliefs given rows, in standard normals of beliefs, shape (batch, n)."""
     count, n = prior.mean.shape
     every = np.arange(count)
 
     def found_at(z: np.ndarray, which: np.ndarray) -> tuple[Tangent, np.ndarray]:
         some = Belief(prior.mean[which], prior.root[which])
         own = row.of(which)
-        made = at(some.mean + np.matvec(some.root, z), which)
+        made = _floored(at(some.mean + np.matvec(some.root, z), which), some.root)
         off = np.linalg.solve(made.noise, own.off(made.mean)[..., None])[..., 0]
         off = np.where(own.present, off, 0.0)
         cost = 0.5 * (np.vecdot(z, z) + np.vecdot(off, off))
-        smooth = np.isfinite(made.slopes).all(axis=(-2, -1))
+        smooth = is_smooth(made, some.root)
         return made, np.where(np.isfinite(cost) & smooth, cost, np.inf)
 
     best, (tangent, cost) = np.zeros((count, n)), found_at(np.zeros((count, n)), every)
@@ -212,7 +281,7 @@ def _mode(prior: Belief, row: Row, at: At) -> np.ndarray:
         if not len(going):
             break
         going = going[_moved(prior, row, going, best, tangent, found_at)]
-    return prior.mean + np.matvec(prior.root, best)
+    return best
 
 
 def _moved(
@@ -234,7 +303,7 @@ def _moved(
     move = _step(some, rows, best[going], own) - best[going]
     change = np.matvec(own.slopes, np.matvec(some.root, move))
     off, sizes = rows.off(own.mean), np.diagonal(own.noise, 0, -2, -1)
-    allowed = _BENT * np.abs(off) + _MISSED / 6 * sizes
+    allowed = _BENT * np.abs(off) + HELD * sizes
     length, gone = np.ones(len(going)), np.zeros(len(going))
     left = np.arange(len(going))
     for _ in range(_HALVINGS):
