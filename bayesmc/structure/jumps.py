@@ -216,19 +216,21 @@ def spread_points(
         Stored values of nodes, shape ``(states, *plates, *event)``, of what is known without the first axis.
     rng : Generator
     count : int
-        Points; none are returned where all states lie at the edge of a support.
+        Points; fewer are returned where numbers run out, none where states lie at edges of supports.
     reach : float
         How far out they are, in standard deviations of the states.
     """
     with marking_invalid(), np.errstate(all="ignore"):
         parts = [node.freed(np.asarray(values[node.name], float), values) for node in nodes]
         rows = [np.reshape(p, (len(p), -1)) for p in parts]
-    u = np.concatenate(rows, axis=1)
-    u = u[np.isfinite(u).all(axis=1)]
-    if len(u) < 2:
-        return u
-    picked = u[rng.integers(len(u), size=count)]
-    return picked + reach * (0.1 + u.std(axis=0)) * rng.standard_normal(picked.shape)
+        u = np.concatenate(rows, axis=1)
+        u = u[np.isfinite(u).all(axis=1)]
+        if len(u) < 2:
+            return u
+        picked = u[rng.integers(len(u), size=count)]
+        far = reach * (0.1 + u.std(axis=0)) * rng.standard_normal(picked.shape)
+        found = picked + far
+    return found[np.isfinite(found).all(axis=1)]
 
 
 # ---- private ------------------------------------------------------------------------------------
