@@ -273,9 +273,10 @@ def _refuse_endless(system: System, names: Sequence[str], wide: np.ndarray) -> N
             raise UnsupportedError(
                 f"ExpectationPropagation: what is believed of node {name!r} narrows without end (its "
                 f"standard deviation has come to {least:.2g}), and factors of {factors} have no integral "
-                "with it: the posterior has no integral, or next to all of its mass at the edge of a "
-                "support, as a scale has whose readings are all equal; give the scale a prior that vanishes "
-                "at the edge (LogNormal, InverseGamma), or the readings the noise of their rounding"
+                "with it. Either the posterior has no integral, or next to all of its mass at the edge of a "
+                "support, as with a scale whose readings are all equal: give the scale a prior that vanishes "
+                "there (LogNormal, InverseGamma), or the readings the noise of their rounding. Or messages "
+                "do not find it, under very vague priors above all: give narrower ones, or take Gibbs"
             )
 
 
