@@ -375,7 +375,7 @@ def test_densities_of_draws_end_where_the_support_does() -> None:
     net = bmc.BayesNet()
     net.add("s", bmc.HalfNormal(5.0))
     net.add("u", bmc.Uniform(0.0, 1.0))
-    prior = bmc.prior_predict(net, {}, draws=4000, rng=0)
+    prior = bmc.prior_predict(net, 4000, rng=0)
     for name, low, high, height in (
         ("s", 0.0, np.inf, 2 / (5 * np.sqrt(2 * np.pi))),
         ("u", 0, 1, 1),

@@ -58,13 +58,14 @@ class SeriesCounts:
                 "fit: nothing is observed: every entry of the series is missing; give rows with values"
             )
         #: whether entries of a node were observed, (steps, *plates), where some were not
-        self.gaps = {
-            n: np.zeros((self.steps, *self.model[n].plate_shape), dtype=bool)
-            if n not in seen
-            else seen[n].mask
-            for n in self.learned
-            if n not in seen or seen[n].mask is not None
-        }
+        self.gaps: dict[str, np.ndarray] = {}
+        for name in self.learned:
+            own = seen.get(name)
+            if own is None:
+                plates = self.model[name].plate_shape
+                self.gaps[name] = np.zeros((self.steps, *plates), dtype=bool)
+            elif own.mask is not None:
+                self.gaps[name] = own.mask
         read = {
             p.removesuffix(PREVIOUS)
             for level in (dbn.template.first, dbn.template.later)

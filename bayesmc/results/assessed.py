@@ -151,6 +151,7 @@ class AssessedByDraws(Assessed):
     model: Any
     weights: np.ndarray | None
     independent: bool
+    ancestors: np.ndarray | None
     ensemble_size: int
     _shape: tuple[int, int]
     _seen: dict[str, Any]
