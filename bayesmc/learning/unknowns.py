@@ -167,6 +167,18 @@ class Unknowns:
                 found.append(f"{p.node.name}[{inside}]" if at else p.node.name)
         return found
 
+    def direction(self, positions: np.ndarray) -> str:
+        """What unconstrained numbers at positions are of: elements where each has its own, else nodes."""
+        labels, found, at = self.labels(), [], 0
+        for p in self.parts:
+            own = labels[at : at + math.prod(p.node.value_shape)]
+            at += len(own)
+            inside = [k - p.start for k in positions if p.start <= k < p.stop]
+            if inside:
+                each = len(own) == p.stop - p.start
+                found += [own[k] for k in inside] if each else [p.node.name]
+        return " with ".join(found[:4]) + (" and others" if len(found) > 4 else "")
+
     def flat(self, u: np.ndarray) -> np.ndarray:
         """All numbers of the values at ``u``, in the order of ``labels``."""
         return np.concatenate([np.ravel(v) for v in self.values(u).values()])
