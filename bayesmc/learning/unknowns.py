@@ -66,6 +66,12 @@ class Unknowns:
         start = 0
         for name in (n for n in model.nodes if n in names):
             node = model[name]
+            if node.support is None and node.domain is None and not node.is_discrete:
+                raise UnsupportedError(
+                    f"fit: the bounds of node {name!r} depend on its parents, which are climbed too; declare "
+                    "how far it lies from them instead, such as high = low + gap with a positive gap, or leave "
+                    "it out of learn="
+                )
             if node.domain is not None or node.is_discrete or node.support is None:
                 raise UnsupportedError(
                     f"fit: node {name!r} is discrete, and values of discrete nodes are not climbed "
