@@ -69,7 +69,7 @@ class Unknowns:
             if node.support is None and node.domain is None and not node.is_discrete:
                 raise UnsupportedError(
                     f"fit: the bounds of node {name!r} depend on its parents, which are climbed too; declare "
-                    "how far it lies from them instead, such as high = low + gap with a positive gap, or leave "
+                    "how far it lies from them instead, such as high = low + gap with gap > 0, or leave "
                     "it out of learn="
                 )
             if node.domain is not None or node.is_discrete or node.support is None:
