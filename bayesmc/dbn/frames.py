@@ -7,8 +7,8 @@ one for each slice and element; else those are columns ``"x[a]"``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,9 @@ import numpy as np
 from bayesmc.dbn.calendar import is_even, uneven_at
 from bayesmc.dbn.slices import TIME, Template
 from bayesmc.errors import EvidenceError
-from bayesmc.network.columns import clock, columns_of, is_frame
+from bayesmc.network.columns import clock, columns_of, is_dated, is_frame, is_text
 from bayesmc.network.frames import names_of, read_table, with_inputs
-from bayesmc.network.labels import is_default
+from bayesmc.network.labels import is_default, oriented
 
 #: what columns of time are called
 _NAMES = (TIME, "time", "step", "slice", "date", "datetime", "timestamp")
@@ -36,6 +36,7 @@ def unframed_series(
         (unless an input says how much time passes).
     """
     times = None
+    _check_indexes(template, observations, inputs)
     if is_frame(observations):
         found, times = _read("observations", template, observations)
         inputs = with_inputs(found, inputs, template.later)
@@ -43,18 +44,33 @@ def unframed_series(
     if is_frame(inputs):
         inputs, own = _read("inputs", template, inputs)
         _check_alike(times, own)
-        times = own if own is not None and (times is None or len(own) > len(times)) else times
+        longer = own is not None and (times is None or len(own.wall) > len(times.wall))
+        times = own if longer else times
     if times is None and isinstance(observations, Mapping):
         times = _index_of(template, observations)
     if times is not None:
         _check_even(template, times, inputs if isinstance(inputs, Mapping) else {})
-    return observations, inputs, times
+    return observations, inputs, None if times is None else times.wall
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _read(what: str, template: Template, frame: Any) -> tuple[dict[str, Any], np.ndarray | None]:
+@dataclass(frozen=True, eq=False)
+class _Times:
+    """Times as the clock on the wall shows them, which label slices, and as instants, which are checked.
+
+    Both are the same array where there is no zone.
+    """
+
+    wall: np.ndarray
+    instants: np.ndarray
+
+    def take(self, rows: np.ndarray) -> _Times:
+        return _Times(self.wall[rows], self.instants[rows])
+
+
+def _read(what: str, template: Template, frame: Any) -> tuple[dict[str, Any], _Times | None]:
     """Node -> its rows, time first, and their times."""
     later, plates = template.later, template.plates
     columns = columns_of(frame, what)
@@ -62,7 +78,11 @@ def _read(what: str, template: Template, frame: Any) -> tuple[dict[str, Any], np
     others = [axis] if axis is not None else []
     table = read_table(what, frame, later, plates.sizes, plates.labels, others)
     table = replace(table, index=None)
-    times = _times(columns[axis]) if axis is not None else _unnamed(frame)
+    times = (
+        _times(what, axis, columns[axis])
+        if axis is not None
+        else _unnamed(what, frame, [*later, *plates.sizes])
+    )
     names = names_of(table.columns, later)
     long = [n for n in names if any(p in table.keys for p in later[n].plates)]
     if long:
@@ -72,17 +92,19 @@ def _read(what: str, template: Template, frame: Any) -> tuple[dict[str, Any], np
                 f"time; give a "
                 "column or an index of times"
             )
-        times, keys = np.unique(times, return_inverse=True)
+        _check_known(what, times.instants)
+        _, first, keys = np.unique(times.instants, return_index=True, return_inverse=True)
+        times = times.take(first)
         table = replace(
             table,
             keys={**table.keys, "time": keys.ravel()},
-            given={**table.given, "time": times[keys]},
-            sizes={**table.sizes, "time": len(times)},
+            given={**table.given, "time": times.wall[keys.ravel()]},
+            sizes={**table.sizes, "time": len(first)},
         )
     elif times is not None:
-        _check_order(what, times)
+        _check_order(what, times.instants)
     if times is not None and TIME in (axis, getattr(getattr(frame, "index", None), "name", None)):
-        _check_zero(what, template, times)
+        _check_zero(what, template, times.wall)
     found = {}
     for name in names:
         own = later[name].plates
@@ -114,44 +136,76 @@ def _time_column(
 
 def _is_dates(column: Any) -> bool:
     array = np.asarray(column)
-    return array.dtype.kind == "O" and array.size > 0 and hasattr(array.ravel()[0], "isoformat")
+    if array.dtype.kind not in "OUT" or not array.size:
+        return False
+    return hasattr(array.ravel()[0], "isoformat") or is_dated(array)
 
 
-def _unnamed(frame: Any) -> np.ndarray | None:
+def _unnamed(what: str, frame: Any, taken: Sequence[str] = ()) -> _Times | None:
     """Times of an index without a name of its own, or with one that says nothing else."""
-    index = getattr(frame, "index", None)
-    if index is None or callable(index) or getattr(index, "nlevels", 1) > 1:
+    index = _index(frame)
+    if index is None or getattr(index, "name", None) in taken or is_default(list(index)):
         return None
-    labels = list(index)
-    return None if is_default(labels) or any(isinstance(v, str) for v in labels) else _times(index)
+    return _times(what, None, index)
 
 
-def _times(labels: Any) -> np.ndarray:
-    """Times by the clock on the wall; by that of Greenwich where only that goes evenly."""
+def _index(frame: Any) -> Any:
+    """The index of a pandas object, where it has one level."""
+    index = getattr(frame, "index", None)
+    if index is None or isinstance(frame, (list, tuple, str)) or callable(index):
+        return None
+    return None if getattr(index, "nlevels", 1) > 1 else index
+
+
+def _times(what: str, name: str | None, labels: Any) -> _Times:
+    """Times of rows; texts are dates as ISO 8601 writes them.
+
+    Raises
+    ------
+    EvidenceError
+        Other texts.
+    """
     wall = clock(labels)
-    if wall.dtype.kind != "M":
-        return wall
-    unique = np.unique(wall)
-    other = clock(labels, zone=True)
-    return wall if is_even(unique) and len(unique) == len(np.unique(other)) else other
+    if is_text(wall):
+        texts = wall.tolist()
+        off = next(v for v in texts if v is not None and not is_dated([v]))
+        where = "the index" if name is None else f"{name!r}"
+        given = "frame.index" if name is None else f"frame[{name!r}]"
+        drop = (
+            "leave the labels out (reset_index(drop=True)) if rows are in the order of time"
+            if name is None
+            else "drop it if rows are in the order of time"
+        )
+        raise EvidenceError(
+            f"{what}: rows are slices of time, and {where} labels them with texts ({off!r}) that are no "
+            f"dates like '2024-01-31', so whether rows are in order cannot be told; give "
+            f"pd.to_datetime({given}, format=...) or numbers, or {drop}"
+        )
+    return _Times(wall, clock(labels, zone=True) if wall.dtype.kind == "M" else wall)
 
 
-def _index_of(template: Template, observations: Mapping[str, Any]) -> np.ndarray | None:
+def _index_of(template: Template, observations: Mapping[str, Any]) -> _Times | None:
     """Times that a Series (or a table of one node) in a dict brings along."""
     for name, value in observations.items():
-        if name in template.later and name not in template.static and hasattr(value, "index"):
-            found = None if callable(value.index) else _unnamed(value)
+        if name in template.later and name not in template.static and _index(value) is not None:
+            oriented(repr(name), value, template.later[name].plates, template.plates.labels, 1)
+            found = _unnamed(repr(name), value)
             if found is not None:
+                _check_order(repr(name), found.instants)
                 return found
     return None
+
+
+def _check_known(what: str, times: np.ndarray) -> None:
+    if times.dtype.kind in "fM" and bool(np.any(times != times)):
+        gap = int(np.flatnonzero(times != times)[0])
+        raise EvidenceError(f"{what}: row {gap} has no time; drop the row")
 
 
 def _check_order(what: str, times: np.ndarray) -> None:
     if np.ndim(times) != 1 or times.dtype.kind not in "iufMm":
         return
-    if times.dtype.kind in "fM" and bool(np.any(times != times)):
-        gap = int(np.flatnonzero(times != times)[0])
-        raise EvidenceError(f"{what}: row {gap} has no time; drop the row")
+    _check_known(what, times)
     for k in np.flatnonzero(times[1:] <= times[:-1])[:1].tolist():
         if times[k + 1] == times[k]:
             raise EvidenceError(
@@ -165,25 +219,77 @@ def _check_order(what: str, times: np.ndarray) -> None:
         )
 
 
-def _check_alike(times: np.ndarray | None, others: np.ndarray | None) -> None:
+def _check_alike(one: _Times | None, other: _Times | None) -> None:
     """Inputs may go on for longer than observations."""
-    if times is None or others is None:
+    if one is None or other is None:
         return
+    times, others = one.instants, other.instants
     count = min(len(times), len(others))
-    for k in np.flatnonzero(times[:count] != others[:count])[:1].tolist():
+    zoned = one.instants is not one.wall and (
+        (one.instants != one.wall).any() or (other.instants != other.wall).any()
+    )
+    for k in range(count):
+        if times.dtype.kind == others.dtype.kind and times[k] == others[k]:
+            continue
+        if times.dtype.kind in "iuf" and others.dtype.kind in "iuf" and times[k] == others[k]:
+            continue
+        by = " (as instants, by UTC)" if zoned else ""
         raise EvidenceError(
             f"row {k} of the observations is of time {_said(times[k])}, and that of the inputs of "
-            f"{_said(others[k])}; row k of both belongs to slice k, so bring them to the same times"
+            f"{_said(others[k])}{by}; row k of both belongs to slice k, so bring them to the same times"
         )
 
 
-def _check_even(template: Template, times: np.ndarray, inputs: Mapping[str, Any]) -> None:
-    """Rows belong to slices one after the other, so time between them is the same, or an input."""
+def _check_indexes(template: Template, observations: Any, inputs: Any) -> None:
+    """Indexes of observations and of inputs that say nothing of time agree, too, position by position."""
+    seen: tuple[str, list[Any]] | None = None
+    both = is_frame(observations) and is_frame(inputs)
+    for what, data in (("observations", observations), ("inputs", inputs)):
+        parts = {what: data} if is_frame(data) else data if isinstance(data, Mapping) else {}
+        for name, value in parts.items():
+            if isinstance(value, np.ndarray) or name in template.static or _index(value) is None:
+                continue
+            if is_frame(value) and name == what and _is_told(what, template, value):
+                continue
+            own = list(_index(value))
+            other, before = seen = seen or (name, own)
+            count = min(len(own), len(before))
+            k = next((k for k in range(count) if own[k] != before[k]), None)
+            if k is not None and not (both and _is_clock(own, before)):
+                raise EvidenceError(
+                    f"{name!r} and {other!r} are labelled unlike along 'time': row {k} is {own[k]!r} in one "
+                    f"and {before[k]!r} in the other; row k belongs to slice k, so bring them to the same "
+                    "index (reindex), or give .to_numpy()"
+                )
+
+
+def _is_told(what: str, template: Template, frame: Any) -> bool:
+    """Whether a column says of which time rows are, or of which element, whatever the index."""
+    columns = columns_of(frame, what)
+    told = _time_column(what, template, columns, None) is not None
+    return told or any(p in columns for p in template.plates.sizes)
+
+
+def _is_clock(own: list[Any], before: list[Any]) -> bool:
+    """Whether both are dates, which are compared as times."""
+    return all(
+        np.asarray(clock(np.array(v, dtype=object))).dtype.kind == "M" for v in (own, before)
+    )
+
+
+def _check_even(template: Template, given: _Times, inputs: Mapping[str, Any]) -> None:
+    """Rows belong to slices one after the other, so time between them is the same, or an input.
+
+    Days are even by the clock on the wall, hours by that of Greenwich.
+    """
+    times = given.instants
     if times.dtype.kind not in "iufM" or len(times) < 2:
         return
-    if is_even(times) or any(_tells(np.asarray(v), times) for v in inputs.values()):
+    if is_even(times) or is_even(given.wall):
         return
-    k = uneven_at(times)
+    if any(_tells(np.asarray(v), times) for v in inputs.values()):
+        return
+    k, times = uneven_at(times), given.wall
     raise EvidenceError(
         f"the rows are not at equal steps of time: from {_said(times[0])} to {_said(times[1])}, and from "
         f"{_said(times[k])} to {_said(times[k + 1])} (rows {k} and {k + 1}), and slices follow each "

@@ -7,9 +7,10 @@ A column is told by what it can do: ``isna`` (pandas), ``null_count`` (polars, p
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC
+from datetime import UTC, datetime
 from numbers import Number
 from typing import Any
 
@@ -17,6 +18,9 @@ import numpy as np
 
 from bayesmc.errors import EvidenceError
 
+_ISO = re.compile(
+    r"\d{4}-\d{2}(-\d{2}([T ]\d{2}:\d{2}(:\d{2}(\.\d+)?)?(?P<offset>Z|[+-]\d{2}:?\d{2})?)?)?$"
+)
 _PLAIN = (np.ndarray, list, tuple, str, int, float, dict)
 
 
@@ -44,6 +48,8 @@ def array_of(value: Any) -> np.ndarray:
     >>> array_of(["yes", None]).tolist(), array_of([1, None]).tolist()
     (['yes', None], [1.0, nan])
     """
+    if getattr(getattr(value, "dtype", None), "time_zone", None) is not None:  # polars', kept
+        return _objects(value.to_list())
     if hasattr(value, "to_pylist"):  # pyarrow's, whose dictionaries are no arrays
         array = _objects(value.to_pylist()) if _is_coded(value) else np.asarray(value)
     else:
@@ -112,6 +118,11 @@ class Labelled:
         """Shape of the numbers."""
         return self.values.shape
 
+    @property
+    def T(self) -> Labelled:  # noqa: N802
+        """The first two axes exchanged."""
+        return Labelled(np.swapaxes(self.values, 0, 1), self.columns, self.index)
+
     def to_numpy(self) -> np.ndarray:
         """The numbers alone."""
         return self.values
@@ -130,13 +141,53 @@ def clock(labels: Any, zone: bool = False) -> np.ndarray:
     elif hasattr(labels, "to_timestamp"):  # pandas' periods
         labels = labels.to_timestamp()
     array = np.asarray(labels)
-    if array.dtype.kind == "O" and array.size and hasattr(array.ravel()[0], "isoformat"):
+    if array.dtype.kind in "OUT" and array.size and is_text(array):
+        return _dates(array, zone)
+    if array.dtype.kind == "O" and any(hasattr(v, "isoformat") for v in array[:1].tolist()):
         plain = [_bare(v, zone) for v in array.tolist()]
         return np.array(plain, dtype="datetime64[us]")
     return array
 
 
+def is_text(labels: Any) -> bool:
+    """Whether labels are texts, some of them perhaps missing."""
+    known = [v for v in np.asarray(labels).ravel().tolist() if not _is_missing(v)]
+    return bool(known) and all(isinstance(v, str) for v in known)
+
+
+def is_dated(labels: Any) -> bool:
+    """Whether labels are texts that are all dates as ISO 8601 writes them (or missing).
+
+    Examples
+    --------
+    >>> from bayesmc.network.columns import is_dated
+    >>> is_dated(["2024-01-31", None]), is_dated(["31/01/2024"])
+    (True, False)
+    """
+    return is_text(labels) and clock(labels).dtype.kind == "M"
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _dates(texts: np.ndarray, zone: bool) -> np.ndarray:
+    """Texts as dates where all are some; else as they are."""
+    plain: list[Any] = []
+    for text in texts.tolist():
+        if _is_missing(text):
+            plain.append(np.datetime64("NaT"))
+            continue
+        match = _ISO.match(text.strip())
+        if match is None:
+            return texts
+        try:
+            if match["offset"]:
+                plain.append(np.datetime64(_bare(datetime.fromisoformat(text.strip()), zone)))
+            else:
+                plain.append(np.datetime64(text.strip().replace(" ", "T")))
+        except ValueError:
+            return texts
+    return np.array(plain, dtype="datetime64[us]")
 
 
 def _levels(data: Any, names: Any) -> dict[str, np.ndarray]:
@@ -144,10 +195,16 @@ def _levels(data: Any, names: Any) -> dict[str, np.ndarray]:
     index: Any = getattr(data, "index", None)
     own = getattr(index, "names", None) or ()
     return {
-        str(name): clock(index.get_level_values(k))
+        str(name): _level(index.get_level_values(k))
         for k, name in enumerate(own)
         if name is not None and str(name) not in names
     }
+
+
+def _level(labels: Any) -> np.ndarray:
+    """Labels of a level; times keep their zone."""
+    zoned = getattr(labels, "tz", None) is not None
+    return np.asarray(labels, dtype=object) if zoned else clock(labels)
 
 
 def _bare(time: Any, zone: bool) -> Any:
@@ -159,7 +216,8 @@ def _bare(time: Any, zone: bool) -> Any:
 
 def _is_coded(column: Any) -> bool:
     kind = str(getattr(column, "type", ""))
-    return kind.startswith(("dictionary", "list", "large_list", "fixed_size_list", "decimal"))
+    coded = kind.startswith(("dictionary", "list", "large_list", "fixed_size_list", "decimal"))
+    return coded or (kind.startswith("timestamp") and "tz=" in kind)
 
 
 def _objects(values: list[Any]) -> np.ndarray:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
-from bayesmc.network.labels import by_label, refuse_crossed
+from bayesmc.network.labels import by_label, oriented, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, observed_links
 from bayesmc.shapes import Shape, at_index, first_index
@@ -198,6 +198,7 @@ def plate_sizes(
             declaration = declarations.get(name)
             if declaration is None or value is None or not declaration.plates:
                 continue
+            value = oriented(f"data of {name!r}", value, declaration.plates, labels)
             shape = value.shape if isinstance(value, np.ndarray) else _shape(value)
             if len(shape) < len(declaration.plates):
                 continue  # said with the node's full shape when the value is read

@@ -17,7 +17,6 @@ import numpy as np
 
 from bayesmc.errors import EvidenceError, did_you_mean
 from bayesmc.network.columns import Labelled, columns_of, is_frame
-from bayesmc.network.labels import is_default
 from bayesmc.network.node import Declaration
 
 _COMPONENT = re.compile(r"^(.*)\[([^\[\]]*)\]$", re.DOTALL)
@@ -76,7 +75,7 @@ class Table:
         else:
             open_ = [p for p in plates if p not in self.keys]
             long = [p for p in plates if p in self.keys]
-            wide = open_ if long or len(open_) == len(plates) == 0 else open_[1:]
+            wide = open_ if long or not plates else _across(self.what, name, parts, open_, labels)
             values, wide = _widened(self.what, name, parts, self.columns, wide, labels)
         keyed = [p for p in plates if p in self.keys]
         by_row = [p for p in plates if p not in keyed and p not in wide]
@@ -302,13 +301,11 @@ def _is_coarse(name: str, names: Sequence[str], declarations: Mapping[str, Decla
 
 
 def _index(frame: Any, plates: Mapping[str, Any]) -> Any:
-    """Labels of rows, where they are more than numbers in order and no column of labels."""
+    """Labels of rows, where they are no column of labels."""
     index = getattr(frame, "index", None)
     if index is None or callable(index) or getattr(index, "nlevels", 1) > 1:
         return None
-    if getattr(index, "name", None) in plates or is_default(list(index)):
-        return None
-    return index
+    return None if getattr(index, "name", None) in plates else index
 
 
 def _positions(
@@ -404,6 +401,40 @@ def _widened(
     ]
     array = np.stack(stacked, axis=1)
     return array.reshape(len(array), *shape), list(plates)
+
+
+def _across(
+    what: str,
+    name: str,
+    parts: Mapping[tuple[str, ...], str],
+    plates: Sequence[str],
+    labels: Mapping[str, tuple[Any, ...]],
+) -> list[str]:
+    """Which plates columns ``name[...]`` go across: all but the one of the rows, by what is in brackets.
+
+    Over time rows are slices.
+    """
+    first = list(plates[1:])
+    if plates[0] == "time":
+        return first
+
+    def fits(across: Sequence[str]) -> bool:
+        return all(
+            len(key) >= len(across)
+            and all(
+                k in map(str, labels[p]) for k, p in zip(key, across, strict=False) if p in labels
+            )
+            for key in parts
+        ) and any(p in labels for p in across)
+
+    ways = [w for w in ([p for p in plates if p != row] for row in plates) if fits(w)]
+    if len(ways) > 1:
+        raise EvidenceError(
+            f"{what}: the columns {', '.join(map(repr, list(parts.values())[:4]))} may be the elements of "
+            f"{ways[0][-1]!r} or of {ways[1][-1]!r}; give a column for each of the plates "
+            f"{tuple(plates)} with its labels, or {name!r} as an array"
+        )
+    return ways[0] if ways else first
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -44,6 +44,7 @@ def by_label(what: str, value: Any, plates: Sequence[str], labels: Labels, ahead
     EvidenceError
         A label stands twice, is none of the plate's, or is missing.
     """
+    value = oriented(what, value, plates, labels, ahead)
     found = _labelled(value, plates, ahead)
     if found is None:
         plain = isinstance(value, np.ndarray) or not is_column(value)
@@ -57,6 +58,59 @@ def by_label(what: str, value: Any, plates: Sequence[str], labels: Labels, ahead
             if order is not None:
                 array = np.take(array, order, axis=axis)
     return array
+
+
+def oriented(what: str, value: Any, plates: Sequence[str], labels: Labels, ahead: int = 0) -> Any:
+    """A table with rows along the first plate and columns along the second; other values as they are.
+
+    The name of its index or columns tells which plate they are, else a plate's labels; where neither does,
+    they are in the order of the plates.
+
+    Raises
+    ------
+    EvidenceError
+        Names and labels settle it both ways; over time (``ahead``), rows are no slices.
+
+    Examples
+    --------
+    >>> import pandas as pd  # doctest: +SKIP
+    >>> from bayesmc.network.labels import oriented
+    >>> table = pd.DataFrame([[1, 2]], columns=["Bonn", "Ulm"])  # doctest: +SKIP
+    >>> labels = {"city": ("Bonn", "Ulm")}
+    >>> oriented("y", table, ("city", "year"), labels).shape  # doctest: +SKIP
+    (2, 1)
+    """
+    if isinstance(value, (np.ndarray, list, tuple, str, int, float)):
+        return value
+    index, columns = getattr(value, "index", None), getattr(value, "columns", None)
+    axes = [*([None] * ahead), *plates][:2]
+    if index is None or columns is None or callable(index) or not axes or not hasattr(value, "T"):
+        return value
+    if getattr(columns, "nlevels", 1) > 1 or getattr(index, "nlevels", 1) > 1:
+        return value
+    axes += [None] * (2 - len(axes))
+    sides = (index, columns)
+    ways = (axes, axes[::-1])
+    straight, crossed = (any(map(_names, sides, way)) for way in ways)
+    own, other = (any(_fits(s, p, labels) for s, p in zip(sides, way, strict=True)) for way in ways)
+    if not straight and not crossed:
+        straight, crossed = own, other
+    elif own != other:  # labels that are told apart say the same as names
+        straight, crossed = straight or own, crossed or other
+    if not crossed or (straight and None in axes):
+        return value
+    if straight:
+        raise EvidenceError(
+            f"{what}: rows and columns of the table may be either of the plates {tuple(plates)}, by what "
+            f"labels them; name them, .rename_axis(index={axes[0]!r}, columns={axes[1]!r}), or give "
+            ".to_numpy() with an axis for each plate in this order"
+        )
+    if ahead:
+        raise EvidenceError(
+            f"{what}: by its labels the table has the plate {plates[0]!r} along its rows; time comes first, "
+            "so give its .T"
+        )
+    return value.T
 
 
 def refuse_crossed(
@@ -76,19 +130,23 @@ def refuse_crossed(
     EvidenceError
     """
     seen: dict[str, tuple[str, list[Any]]] = {}
+    data = [(n, oriented(f"data of {n!r}", v, p, labels, int(timed)), p) for n, v, p in data]
     for name, value, plates in data:
         ahead = 1 if timed else 0
         found = _labelled(value, plates, ahead)
         if found is None:
             continue
         for plate, own in zip([*(["time"] * ahead), *plates], found[1], strict=False):
-            if own is None or is_default(own) or (plate in labels):
+            if own is None or plate in labels:
                 continue
             other, before = seen.setdefault(plate, (name, own))
             if _differ(own, before, timed and plate == "time"):
+                k = next(
+                    (k for k, (a, b) in enumerate(zip(own, before, strict=False)) if a != b), 0
+                )
                 raise EvidenceError(
-                    f"{name!r} and {other!r} are labelled unlike along {plate!r}: "
-                    f"{_some(own)} and {_some(before)}; {_remedy(plate)}"
+                    f"{name!r} and {other!r} are labelled unlike along {plate!r}: from position {k} on "
+                    f"{_some(own[k:])} and {_some(before[k:])}; {_remedy(plate)}"
                 )
 
 
@@ -299,6 +357,19 @@ def _of_dims(
         value = value.transpose(*dims)
     own = [np.asarray(value.coords[d]).tolist() if d in value.coords else None for d in dims]
     return np.asarray(value), own
+
+
+def _names(side: Any, plate: str | None) -> bool:
+    return plate is not None and getattr(side, "name", None) == plate
+
+
+def _fits(side: Any, plate: str | None, labels: Labels) -> bool:
+    """Whether labels are a plate's: all of them, of texts some (a wrong one is told later)."""
+    own = list(side)
+    if plate not in labels or is_default(own):
+        return False
+    shared = set(labels[plate]) & set(own)
+    return len(shared) == len(own) or any(isinstance(label, str) for label in shared)
 
 
 def _order(what: str, plate: str, own: list[Any], wanted: tuple[Any, ...]) -> list[int] | None:

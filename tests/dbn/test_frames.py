@@ -149,3 +149,43 @@ def test_static_nodes_are_learned_from_a_frame() -> None:
     y = np.cumsum(np.random.default_rng(0).normal(size=20))
     frame = pd.DataFrame({"y": y}, index=pd.date_range("2020-01-01", periods=20, freq="MS"))
     assert bmc.fit(dbn, frame)["q"] == pytest.approx(float(bmc.fit(dbn, {"y": y})["q"]))
+
+
+def test_texts_are_dates_or_are_refused() -> None:
+    rows = pd.DataFrame({"date": ["2024-01-01", "2024-01-02", "2024-01-03"], "y": [1.0, 2.0, 3.0]})
+    for frame in (rows, rows.set_index("date"), {"y": rows.set_index("date")["y"]}):
+        found = bmc.forecast(level(), frame, steps=1)
+        assert found.times.astype("M8[D]").astype(str).tolist() == ["2024-01-04"]
+    for change, words in (
+        (rows.iloc[[0, 2, 1]], "row 2 is of time 2024-01-02, before 2024-01-03"),
+        (rows.assign(date=["2024-01-01", "2024-01-02", "2024-02-15"]), "not at equal steps"),
+        (rows.assign(date=["2024-01-01", None, "2024-01-03"]), "row 1 has no time"),
+        (
+            rows.assign(date=["1/2/24", "2/2/24", "3/2/24"]),
+            r"'date' .*pd.to_datetime\(frame\['date'\]",
+        ),
+        (rows[["y"]].set_axis(list("aba")), r"the index labels them with texts .*reset_index"),
+    ):
+        with pytest.raises(EvidenceError, match=words):
+            bmc.filter(level(), change)
+
+
+@pytest.mark.parametrize("count", [3, 60])
+def test_zones_label_by_the_wall_and_compare_as_instants(count: int) -> None:
+    index = pd.date_range("2024-10-26 23:00", periods=count, freq="h", tz="Europe/Berlin")
+    rows = pd.DataFrame({"y": np.zeros(count)}, index=index)
+    for frame in (rows, rows.rename_axis("time"), rows.assign(time=index)):
+        assert (bmc.filter(level(), frame).times == index.tz_localize(None).to_numpy()).all()
+    dbn = bmc.DynamicBayesNet()
+    dbn.input("u")
+    dbn.add("x", lambda x_prev, u: bmc.Normal(x_prev + u, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    same = pd.DataFrame({"u": np.zeros(count)}, index=index.tz_convert("UTC"))
+    assert bmc.filter(dbn, rows, inputs=same).times[0] == np.datetime64("2024-10-26T23:00")
+    wall = same.set_axis(same.index + pd.Timedelta("5h"))
+    for inputs in (wall, {"u": wall["u"]}):
+        with pytest.raises(EvidenceError, match="row 0 "):
+            bmc.filter(dbn, rows, inputs=inputs)
+    numbered = rows.reset_index(drop=True)
+    with pytest.raises(EvidenceError, match="labelled unlike along 'time'"):
+        bmc.filter(dbn, numbered, inputs={"u": numbered["y"].iloc[::-1]})

@@ -232,3 +232,48 @@ def test_what_is_no_frame_and_texts_that_are_no_numbers() -> None:
         bmc.infer(net, pd.DataFrame({"y": ["1", "2"]}))
     with pytest.raises(EvidenceError, match="the data have two columns 'y'"):
         bmc.infer(net, pd.DataFrame([[1.0, 2.0]], columns=["y", "y"]))
+
+
+def test_labels_and_names_say_which_axis_is_which() -> None:
+    net = bmc.BayesNet(plates={"city": ["Bonn", "Ulm"], "year": None})
+    net.add("m", bmc.Normal(0.0, 3.0), plates="city")
+    net.add("y", lambda m: bmc.Normal(m, 1.0), plates=("city", "year"))
+    for years in (2, 3):
+        rows = [[1.0, 40.0], [2.0, 50.0], [3.0, 60.0]][:years]
+        wide = pd.DataFrame(rows, columns=["Bonn", "Ulm"])
+        wanted = bmc.infer(net, {"y": wide.to_numpy().T}).mean("m")
+        stacked = wide.copy()
+        stacked.columns = pd.MultiIndex.from_product([["y"], wide.columns])
+        named = wide.set_axis([0, 1], axis=1).rename_axis(index="year", columns="city")
+        flat = wide.rename(columns="y[{}]".format)
+        for given in ({"y": wide}, {"y": wide.T}, {"y": named}, {"y": named.T}, stacked, flat):
+            np.testing.assert_allclose(bmc.infer(net, given).mean("m"), wanted)
+    both = wide[:2].set_axis(["Bonn", "Ulm"])
+    twins = bmc.BayesNet(plates={"city": ["Bonn", "Ulm"], "to": ["Bonn", "Ulm"]})
+    twins.add("y", bmc.Normal(0.0, 1.0), plates=("city", "to"))
+    for asked, given in (
+        (twins, {"y": both}),
+        (net, {"y": wide[:2].rename_axis(index="city")}),
+        (twins, both.reset_index(drop=True).rename(columns="y[{}]".format)),
+    ):
+        with pytest.raises(EvidenceError, match="may be (either|the elements) of"):
+            bmc.infer(asked, given)
+
+
+def test_indexes_in_another_order() -> None:
+    net = bmc.BayesNet(plates={"i": None})
+    net.input("x", plates="i")
+    net.add("slope", bmc.Normal(0.0, 3.0))
+    net.add("y", lambda slope, x: bmc.Normal(slope * x, 1.0), plates="i")
+    rows = pd.DataFrame({"x": [1.0, 2.0, 3.0], "y": [1.0, 2.0, 3.0]})
+    turned = rows.iloc[::-1]
+    wanted = bmc.infer(net, rows).mean("slope")
+    for y, x in ((turned["y"], turned["x"]), (turned["y"], turned["x"].to_numpy())):
+        assert bmc.infer(net, {"y": y}, inputs={"x": x}).mean("slope") == pytest.approx(wanted)
+    for evidence, inputs in (
+        ({"y": turned["y"]}, {"x": rows["x"]}),
+        (rows[["y"]], turned[["x"]]),
+        (turned[["y"]], {"x": rows["x"]}),
+    ):
+        with pytest.raises(EvidenceError, match="labelled unlike along 'i'"):
+            bmc.infer(net, evidence, inputs=inputs)

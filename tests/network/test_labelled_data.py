@@ -137,7 +137,7 @@ def test_rows_over_time():
     engine = bmc.KalmanFilter()
     belief = engine.step(engine.start(dbn), {"y": Series([1, 10], "ba")})
     np.testing.assert_allclose(belief.mean("x"), wanted[0])
-    with pytest.raises(EvidenceError, match=r"row 1 is labelled 12, before 13 of row 0"):
+    with pytest.raises(EvidenceError, match=r"row 1 is of time 12, before 13 of row 0"):
         bmc.filter(dbn, {"y": Frame(rows[::-1], (13, 12, 11), "ab")})
 
 
