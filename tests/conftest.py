@@ -13,6 +13,8 @@ Tests marked ``thorough`` take long and are much like others; an ordinary run le
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -38,6 +40,14 @@ def pytest_configure(config: pytest.Config) -> None:
     # Hypothesis reads the option after this
     if session.is_thorough() and getattr(config.option, "hypothesis_seed", "") is None:
         config.option.hypothesis_seed = str(session.seed())
+
+
+@pytest.fixture(autouse=True)
+def figures_closed() -> Iterator[None]:
+    """Pictures that a test, a page or a docstring leaves open are not the next one's."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 def data_root() -> Path:

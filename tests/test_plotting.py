@@ -14,6 +14,7 @@ from matplotlib.patches import Ellipse, FancyArrowPatch, FancyBboxPatch
 
 import bayesmc as bmc
 from bayesmc.drawing.layout import Layout, Rectangle, layered_layout
+from bayesmc.errors import UnsupportedError
 from bayesmc.plotting import plot_dag, plot_marginal, plot_prior_posterior
 
 pyplot.switch_backend("agg")
@@ -368,3 +369,33 @@ def test_an_exact_marginal_is_drawn_as_the_curve_it_is() -> None:
     np.testing.assert_allclose(heights, expected, atol=1e-12)
     assert points[0] < -1.2 and points[-1] > 5.2
     pyplot.close(ax.figure)
+
+
+def test_densities_of_draws_end_where_the_support_does() -> None:
+    net = bmc.BayesNet()
+    net.add("s", bmc.HalfNormal(5.0))
+    net.add("u", bmc.Uniform(0.0, 1.0))
+    prior = bmc.prior_predict(net, 4000, rng=0)
+    for name, low, high, height in (
+        ("s", 0.0, np.inf, 2 / (5 * np.sqrt(2 * np.pi))),
+        ("u", 0, 1, 1),
+    ):
+        (line,) = plot_marginal(prior, name).get_lines()
+        points, heights = line.get_data()
+        assert points[0] == low and points[-1] <= high
+        assert heights[0] == pytest.approx(height, rel=0.15)  # half of it without the reflection
+        assert np.trapezoid(heights, points) == pytest.approx(1.0, abs=0.01)
+        assert prior.marginal(name).density([-0.1]) == 0.0
+    for ax in plot_prior_posterior(prior, prior, ["s", "u"]):
+        assert ax.get_lines()[0].get_xdata()[0] == 0.0
+
+
+@pytest.mark.parametrize("picture", ["forest", "pair", "marginal"])
+def test_beliefs_over_time_say_which_pictures_they_have(picture: str) -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 3.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.5))
+    for engine in (bmc.KalmanFilter(), bmc.GridFilter(), bmc.ParticleFilter(50)):
+        filtered = bmc.filter(dbn, {"y": [1.0, 2.0]}, engine=engine, rng=0)
+        with pytest.raises(UnsupportedError, match=rf"plot_{picture}: .* bands\(name\)"):
+            getattr(filtered.plot, picture)("x")

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import closing
-from typing import Any, overload
+from contextlib import AbstractContextManager, closing, nullcontext
+from typing import Any, NamedTuple, overload
 
 import numpy as np
 
@@ -115,7 +115,11 @@ def filter(  # type: ignore[misc]
         return several("filter", _filtered, dbn, observations, inputs, engine, seed, quiet, *work)
     problem = pose_series(dbn, observations, inputs)
     own = None if rng is None else seed_sequence(rng)
-    return _filtered(problem, engine, own, {**options, "checkpoint": checkpoint}, executor)
+    run = _begun(problem, engine, own, {**options, "checkpoint": checkpoint}, executor)
+    with run.kept, picks_told(problem.slices, problem.series):
+        # asked here: warnings name the line that called
+        found = run.answer or run.engine.filter(problem, run.seed, **run.options)
+        return run.ended(problem, found)
 
 
 @overload
@@ -266,14 +270,37 @@ def most_likely(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _filtered(
+class _Run(NamedTuple):
+    """A series that is about to be filtered, or was by an earlier call that saved its answer."""
+
+    engine: FilterEngine
+    seed: np.random.SeedSequence
+    options: dict[str, Any]
+    file: Any = None
+    answer: SeriesPosterior | None = None
+
+    @property
+    def kept(self) -> AbstractContextManager[Any]:
+        """The file of the run, closed in the end."""
+        return nullcontext() if self.file is None else closing(self.file)
+
+    def ended(self, problem: SeriesProblem, found: SeriesPosterior) -> SeriesPosterior:
+        """The answer, with its times, and in the file where the engine has not put it there."""
+        found.times = problem.times
+        saved = self.file is None or self.engine.saves
+        if not saved and not getattr(found, "interrupted", False):
+            self.file.finish(found)
+        return found
+
+
+def _begun(
     problem: SeriesProblem,
     engine: FilterEngine | None,
     seed: np.random.SeedSequence | None,
     options: dict[str, Any],
     executor: Any = None,
-) -> SeriesPosterior:
-    """One series; without a seed by that of its file, or a new one."""
+) -> _Run:
+    """What is to be run; without a seed by that of its file, or a new one."""
     checkpoint = options.get("checkpoint")
     options = {n: v for n, v in options.items() if n != "checkpoint"}
     opened = None
@@ -286,25 +313,25 @@ def _filtered(
         options["executor"] = executor
     if seed is None:
         seed = seed_sequence(None) if opened is None else opened.seed(None)
-    found: SeriesPosterior
     if opened is None:
-        with picks_told(problem.slices, problem.series):
-            found = chosen.filter(problem, seed, **options)
-        found.times = problem.times
-        return found
+        return _Run(chosen, seed, options)
     file, answer = opened.begin(chosen, seed, options["keep"], {"queries": options["queries"]})
-    if file is None:
-        found = answer
-        found.times = problem.times
-        return found
-    with closing(file):
-        more: dict[str, Any] = {"checkpoint": file} if chosen.saves else {}
-        with picks_told(problem.slices, problem.series):
-            found = chosen.filter(problem, seed, **options, **more)
-        found.times = problem.times
-        if not chosen.saves and not getattr(found, "interrupted", False):
-            file.finish(found)
-    return found
+    if file is not None and chosen.saves:
+        options["checkpoint"] = file
+    return _Run(chosen, seed, options, file, answer)
+
+
+def _filtered(
+    problem: SeriesProblem,
+    engine: FilterEngine | None,
+    seed: np.random.SeedSequence,
+    options: dict[str, Any],
+) -> SeriesPosterior:
+    """One of several series."""
+    run = _begun(problem, engine, seed, options)
+    with run.kept, picks_told(problem.slices, problem.series):
+        found = run.answer or run.engine.filter(problem, run.seed, **run.options)
+        return run.ended(problem, found)
 
 
 def _smoothed(

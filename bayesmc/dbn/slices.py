@@ -433,7 +433,8 @@ def _check_alike(template: Template, first: Model, later: Model) -> None:
 
 def _face(node: CompiledNode) -> list[tuple[Any, str]]:
     """What must be the same of a node in all slices, each with words for it."""
-    chance = "a distribution" if node.is_stochastic else "values without chance"
+    lag = "by chance a lag is Bernoulli(1.0 * s_prev) or Normal(x_prev, 0.0)"
+    chance = "a distribution" if node.is_stochastic else f"values without chance ({lag})"
     states = node.domain.states if node.domain is not None and node.is_stochastic else None
     return [
         (node.is_stochastic, chance),

@@ -15,6 +15,11 @@ _TRIED, _CLIMBED = 32, 3
 _RISE = 1e-5
 #: curvature, in nats, below which there is none, and the slope that may be left along such directions
 _FLAT, _SLOPE = 1e-4, 1e-3
+#: information below which numbers are not told, over a step as long as they are; the same of combinations
+#: of them, beside that of each by itself
+_UNTOLD, _SINGULAR = 1e-4, 1e-6
+#: nats that the objective must be lower two standard errors away, where a parabola is 2 lower
+_FALL = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,49 @@ def curvature(objective: Objective, u: np.ndarray) -> np.ndarray:
         at[1, k] += step
         found[k] = (objective.gradient(at[1]) - objective.gradient(at[0])) / (2 * step)
     return 0.5 * (found + found.T)
+
+
+def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np.ndarray]]:
+    """The covariance that a curvature says, and groups of numbers that it does not tell.
+
+    A direction is told where the objective is curved in it, and lower two standard errors away: it is 2 nats
+    lower if it is a parabola, and no lower where it rises for ever.
+
+    Returns
+    -------
+    ndarray, shape (size, size)
+        NaN for what is not told, and everywhere where the curvature is not that of a maximum.
+    list of ndarray
+        Positions: a number alone that the objective is flat in, or several with a flat combination.
+    """
+    u, hessian = found.u, found.hessian
+    size = len(u)
+    covariance = np.full((size, size), np.nan)
+    information = -hessian
+    scale = np.maximum(1.0, np.abs(u))
+    own = np.diagonal(information)
+    with np.errstate(invalid="ignore", over="ignore"):
+        alone = ~(own * scale**2 > _UNTOLD) | ~np.isfinite(information).all(axis=0)
+    groups = [np.array([k]) for k in np.flatnonzero(alone)]
+    rest = np.flatnonzero(~alone)
+    if not len(rest):
+        return covariance, groups
+    unit = 1.0 / np.sqrt(own[rest])
+    values, vectors = np.linalg.eigh(information[np.ix_(rest, rest)] * np.outer(unit, unit))
+    if (values < -_SINGULAR).any():
+        return covariance, groups
+    flat = values <= _SINGULAR
+    for k in np.flatnonzero(~flat) if found.converged else ():
+        step = np.zeros(size)
+        step[rest] = 2.0 * unit * vectors[:, k] / np.sqrt(values[k])
+        flat[k] = any(not objective.value(at) < found.value - _FALL for at in (u - step, u + step))
+    takes_part = np.abs(vectors[:, flat]) > 0.1
+    groups += [rest[own] for own in takes_part.T]
+    inner = (vectors[:, ~flat] / values[~flat]) @ vectors[:, ~flat].T * np.outer(unit, unit)
+    lost = takes_part.any(axis=1)
+    inner[lost], inner[:, lost] = np.nan, np.nan
+    covariance[np.ix_(rest, rest)] = inner
+    return covariance, groups
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -16,8 +16,14 @@ from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.question import free_density
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.filtering import FilterEngine
-from bayesmc.errors import ConvergenceWarning, ModelError, UnsupportedError, did_you_mean
-from bayesmc.learning.climbing import Maximum, maximum
+from bayesmc.errors import (
+    ConvergenceWarning,
+    EvidenceError,
+    ModelError,
+    UnsupportedError,
+    did_you_mean,
+)
+from bayesmc.learning.climbing import Maximum, maximum, told_part
 from bayesmc.learning.fitted import Fit
 from bayesmc.learning.objectives import Density, Evidence, Objective, hidden_numbers
 from bayesmc.learning.tables import fit_tables
@@ -93,7 +99,8 @@ def fit(
     Warns
     -----
     ConvergenceWarning
-        It ended before a maximum, or at an edge.
+        It ended before a maximum, at an edge, or where the curvature is singular: the data do not tell a
+        number or a combination of several, or it ran off. They are named, and have no standard error.
 
     Notes
     -----
@@ -234,6 +241,8 @@ def _objective(
     if engine is not None:
         raise UnsupportedError("fit(engine=...): engines over time are for templates; leave it out")
     problem = pose(net, data, inputs)
+    if not problem.model.potentials:
+        _check_observed(problem.observed, prior)
     unknowns = Unknowns.of(problem.model, names, problem.inputs)
     others = hidden_numbers(problem, names)
     if not others:
@@ -241,6 +250,16 @@ def _objective(
         if set(density.names) == set(names):
             return Density(density, log_constants(density.target), unknowns, prior), unknowns
     return _by_elimination(net, data, inputs, unknowns, prior, others), unknowns
+
+
+def _check_observed(observed: Mapping[str, Any], prior: bool) -> None:
+    """Something must be: a likelihood of nothing is flat, and any start is its maximum."""
+    if prior or any(seen.mask is None or seen.mask.any() for seen in observed.values()):
+        return
+    raise EvidenceError(
+        "fit: nothing is observed (no entry of the data has a value), so that every value is as likely as "
+        "any other; give data, or use prior=True for the mode of the prior"
+    )
 
 
 def _by_elimination(
@@ -281,6 +300,7 @@ def _of_template(
     engine: FilterEngine | None,
 ) -> tuple[Objective, Unknowns]:
     problem = pose_series(dbn, data, inputs)
+    _check_observed(problem.series.observed, prior)
     for name in names:
         if name not in dbn.static_nodes:
             raise UnsupportedError(
@@ -330,33 +350,48 @@ def _fitted(
     prior: bool,
 ) -> Fit:
     values = unknowns.values(found.u)
-    covariance = _covariance(unknowns, found)
+    told, untold = told_part(objective, found)
+    covariance = _covariance(unknowns, found, told)
     spread = np.sqrt(np.diagonal(covariance))
     errors, at = {}, 0
     for name, value in values.items():
         errors[name] = spread[at : at + value.size].reshape(value.shape)
         at += value.size
-    if not found.converged:
-        flat = [x for x, e in zip(unknowns.labels(), spread, strict=True) if not np.isfinite(e)]
-        told = (
-            f" the data do not tell {', '.join(flat[:4])}, or it lies at an edge:" if flat else ""
-        )
-        warnings.warn(
-            f"fit: the climb ended after {found.steps} steps before a maximum:{told} look at history, "
-            "give start=, or "
-            "use prior=True with priors that say more",
-            ConvergenceWarning,
-            stacklevel=3,
-        )
+    if not found.converged or untold:
+        _warn(unknowns, found, untold, spread, prior)
     what = "posterior mode" if prior else "maximum likelihood"
     log_prior = unknowns.log_prior(found.u) if prior else 0.0
     return Fit(
         _filled(net, values), values, errors, found.value - log_prior, found.value, found.history,
-        found.converged, found.steps, what, covariance, tuple(unknowns.labels()),
+        found.converged and not untold, found.steps, what, covariance, tuple(unknowns.labels()),
     )  # fmt: skip
 
 
-def _covariance(unknowns: Unknowns, found: Maximum) -> np.ndarray:
+def _warn(
+    unknowns: Unknowns, found: Maximum, untold: list[np.ndarray], spread: np.ndarray, prior: bool
+) -> None:
+    """That this is no maximum, or none that the data tell, and in which numbers."""
+    remedy = "priors that say more" if prior else "prior=True with priors that say more"
+    if untold:
+        of = "posterior density" if prior else "likelihood"
+        flat = "; ".join(unknowns.direction(group) for group in untold[:4])
+        more = "; and more" if len(untold) > 4 else ""
+        message = (
+            f"fit: at the estimate the {of} is next to flat in {flat}{more}: the data do not tell it, or it "
+            "runs to an edge or off to infinity (several with each other: only a combination of them); what "
+            f"is returned is one point of many; observe more, simplify the model, or use {remedy}"
+        )
+    else:
+        edge = [x for x, e in zip(unknowns.labels(), spread, strict=True) if not np.isfinite(e)]
+        at = f" {', '.join(edge[:4])} may run to an edge:" if edge else ""
+        message = (
+            f"fit: the climb ended after {found.steps} steps before a maximum:{at} look at history, give "
+            f"start=, or use {remedy}"
+        )
+    warnings.warn(message, ConvergenceWarning, stacklevel=4)
+
+
+def _covariance(unknowns: Unknowns, found: Maximum, covariance: np.ndarray) -> np.ndarray:
     """Of the values, by the delta method; NaN where the curvature is none of a maximum's."""
     size = unknowns.size
     jacobian = np.empty((len(unknowns.flat(found.u)), size))
@@ -366,12 +401,6 @@ def _covariance(unknowns: Unknowns, found: Maximum) -> np.ndarray:
         at[0, k] -= step
         at[1, k] += step
         jacobian[:, k] = (unknowns.flat(at[1]) - unknowns.flat(at[0])) / (2 * step)
-    information = -found.hessian
-    told = np.isfinite(information).all(axis=0) & (np.diagonal(information) > 1e-4)
-    covariance = np.full((size, size), np.nan)
-    inner = np.ix_(told, told)
-    if told.any() and np.linalg.eigvalsh(information[inner]).min() > 0:
-        covariance[inner] = np.linalg.inv(information[inner])
     with np.errstate(invalid="ignore"):
         spread = np.where(np.isnan(covariance), 0.0, covariance)
         result = jacobian @ spread @ jacobian.T

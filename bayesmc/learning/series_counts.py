@@ -14,7 +14,7 @@ from bayesmc.dbn import UNCOMPARED, DynamicBayesNet, pose_series
 from bayesmc.dbn.slices import PREVIOUS, TIME, SliceStore
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
-from bayesmc.errors import QueryError, UnsupportedError
+from bayesmc.errors import EvidenceError, QueryError, UnsupportedError
 from bayesmc.network.node import Declaration
 
 #: what an initial table is called among those that are learned
@@ -52,6 +52,27 @@ class SeriesCounts:
                 f"fit: tables of a template are learned where all that is hidden is finite: {refused}"
             )
         self.steps, self.model = problem.steps, problem.model
+        seen = problem.series.observed
+        if not any(o.mask is None or o.mask.any() for o in seen.values()):
+            raise EvidenceError(
+                "fit: nothing is observed: every entry of the series is missing; give rows with values"
+            )
+        #: whether entries of a node were observed, (steps, *plates), where some were not
+        self.gaps: dict[str, np.ndarray] = {}
+        for name in self.learned:
+            own = seen.get(name)
+            if own is None:
+                plates = self.model[name].plate_shape
+                self.gaps[name] = np.zeros((self.steps, *plates), dtype=bool)
+            elif own.mask is not None:
+                self.gaps[name] = own.mask
+        read = {
+            p.removesuffix(PREVIOUS)
+            for level in (dbn.template.first, dbn.template.later)
+            for declared in level.values()
+            for p in declared.parents
+        }
+        self.leaves = frozenset(n for n in self.gaps if n not in read)
 
     def tables(self) -> dict[str, np.ndarray]:
         """The tables as they are declared."""
@@ -138,8 +159,6 @@ class _Slices:
 
     def _within(self, names: tuple[str, ...]) -> np.ndarray:
         """Joint tables of nodes of one slice, time first."""
-        if len(names) == 1:
-            return self.smoothed.probabilities(names[0])
         states = [self.owner.model[n].domain.states for n in names]  # type: ignore[union-attr]
         plates = self.owner.model[names[-1]].plates
         if any(self.owner.model[n].plates != plates for n in names):
@@ -147,6 +166,10 @@ class _Slices:
                 f"fit: the table of {names[-1]!r} reads nodes in other plates than its own; such "
                 "tables are not learned"
             )
+        if names[-1] in self.owner.leaves:
+            return self._of_leaf(names)
+        if len(names) == 1:
+            return self.smoothed.probabilities(names[0])
 
         def joint(*values: Any) -> np.ndarray:
             total: Any = 1.0
@@ -161,6 +184,20 @@ class _Slices:
         # a function with the nodes' own names as arguments, as queries read them
         joint.__signature__ = _signature(names)  # type: ignore[attr-defined]
         return self.smoothed.expectation(joint)
+
+    def _of_leaf(self, names: tuple[str, ...]) -> np.ndarray:
+        """The same of a node that nobody reads: where it is missing the likelihood does not read its table.
+
+        Such an entry is left out of the complete data, and nothing is counted.
+        """
+        own = self.smoothed.probabilities(names[-1])
+        own = own * self.owner.gaps[names[-1]][..., None]
+        if len(names) == 1:
+            return own
+        above = self._within(names[:-1])
+        return above[..., None] * own.reshape(
+            *own.shape[:-1], *(1,) * (len(names) - 1), own.shape[-1]
+        )
 
     def _at_once(self, names: tuple[str, ...]) -> np.ndarray:
         """Sums of joint tables over pairs of slices, from the exact posterior of all slices."""

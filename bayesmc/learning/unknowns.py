@@ -66,6 +66,12 @@ class Unknowns:
         start = 0
         for name in (n for n in model.nodes if n in names):
             node = model[name]
+            if node.support is None and node.domain is None and not node.is_discrete:
+                raise UnsupportedError(
+                    f"fit: the bounds of node {name!r} depend on its parents, which are climbed too; declare "
+                    "how far it lies from them instead, such as high = low + gap with gap > 0, or leave "
+                    "it out of learn="
+                )
             if node.domain is not None or node.is_discrete or node.support is None:
                 raise UnsupportedError(
                     f"fit: node {name!r} is discrete, and values of discrete nodes are not climbed "
@@ -166,6 +172,18 @@ class Unknowns:
                 inside = ", ".join(axis[i] for axis, i in zip(labels, at, strict=True))
                 found.append(f"{p.node.name}[{inside}]" if at else p.node.name)
         return found
+
+    def direction(self, positions: np.ndarray) -> str:
+        """What unconstrained numbers at positions are of: elements where each has its own, else nodes."""
+        labels, found, at = self.labels(), [], 0
+        for p in self.parts:
+            own = labels[at : at + math.prod(p.node.value_shape)]
+            at += len(own)
+            inside = [k - p.start for k in positions if p.start <= k < p.stop]
+            if inside:
+                each = len(own) == p.stop - p.start
+                found += [own[k] for k in inside] if each else [p.node.name]
+        return " with ".join(found[:4]) + (" and others" if len(found) > 4 else "")
 
     def flat(self, u: np.ndarray) -> np.ndarray:
         """All numbers of the values at ``u``, in the order of ``labels``."""

@@ -173,8 +173,9 @@ def unframed(
         inputs = _by_name(table, declarations, labels)
     for what, data in (("evidence", evidence), ("inputs", inputs)):
         if data is not None and not isinstance(data, Mapping):
+            said = "inputs are" if what == "inputs" else f"{what} is"
             raise EvidenceError(
-                f"{what} is a {type(data).__name__}; give a dict from node name to value, or a data frame"
+                f"{said} a {type(data).__name__}; give a dict from node name to value, or a data frame"
             )
     return evidence, inputs
 

@@ -366,7 +366,7 @@ def _names(side: Any, plate: str | None) -> bool:
 def _fits(side: Any, plate: str | None, labels: Labels) -> bool:
     """Whether labels are a plate's: all of them, of texts some (a wrong one is told later)."""
     own = list(side)
-    if plate not in labels or is_default(own):
+    if plate is None or plate not in labels or is_default(own):
         return False
     shared = set(labels[plate]) & set(own)
     return len(shared) == len(own) or any(isinstance(label, str) for label in shared)

@@ -154,6 +154,8 @@ def _curves(posterior: Posterior, name: str) -> Inset | None:
     ):  # no further than draws: a scale is not below 0
         left = max(left, min(float(m.values.min()) for m in marginals))
         right = min(right, max(float(m.values.max()) for m in marginals))
+    left = max(left, min(m.ends[0] for m in marginals))
+    right = min(right, max(m.ends[1] for m in marginals))
     points = np.linspace(left, right, 120)
     heights = np.array([m.density(points) for m in marginals])
     peak = heights.max(axis=1, keepdims=True)

@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesmc.errors import QueryError, UnsupportedError
 from bayesmc.plotting.pyplot import pyplot
-from bayesmc.results import Posterior
+from bayesmc.results import Posterior, SeriesPosterior
 from bayesmc.results.over_time import expanded
 from bayesmc.states import StateArray
 
@@ -46,6 +46,31 @@ class Scalar:
         return np.asarray(values[(slice(None), slice(None), *self.index)], dtype=float)
 
 
+def check_posterior(answer: Any, what: str) -> None:
+    """That there are draws or tables of one net, not beliefs slice by slice.
+
+    Raises
+    ------
+    UnsupportedError
+        The message has the pictures that there are.
+    """
+    if isinstance(answer, Posterior):
+        return
+    if isinstance(answer, SeriesPosterior):
+        particles = getattr(answer, "weight_ess", None) is not None
+        others = (
+            ", weights() and, of filters with particles kept, ancestry(name)" if particles else ""
+        )
+        raise UnsupportedError(
+            f"{what}: a {type(answer).__name__} has beliefs slice by slice; its pictures are bands(name) and "
+            f"forecast(ahead, name){others}. For this one ask infer(template, rows), whose numbers are "
+            'named with their slice, "x[3]"'
+        )
+    raise UnsupportedError(
+        f"{what}: {type(answer).__name__} is no posterior; give what infer returned"
+    )
+
+
 def chosen_scalars(
     posterior: Posterior, names: Names | None, what: str, most: int = MOST
 ) -> tuple[list[Scalar], str]:
@@ -55,8 +80,9 @@ def chosen_scalars(
     ------
     UnknownNodeError, QueryError
     UnsupportedError
-        A named node has labels, which are no numbers.
+        A named node has labels, which are no numbers; the answer is no posterior of a net.
     """
+    check_posterior(posterior, what)
     every = list(_of_names(posterior, names, what))
     if not every:
         raise QueryError(

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.errors import UnsupportedError
+from bayesmc.plotting.look import check_posterior
 from bayesmc.plotting.pyplot import pyplot
 from bayesmc.results import Marginal, Posterior
 
@@ -69,6 +70,7 @@ def plot_marginal(
     >>> [round(float(bar.get_height()), 3) for bar in ax.patches]
     [0.8, 0.2]
     """
+    check_posterior(posterior, "plot_marginal")
     marginal = _scalar(posterior, name, index)
     if ax is None:
         ax = pyplot().subplots(figsize=(4.0, 3.0), layout="constrained")[1]
@@ -137,6 +139,8 @@ def plot_prior_posterior(
     >>> [round(float(bar.get_height()), 3) for bar in axes[0].patches]
     [0.8, 0.2, 0.308, 0.692]
     """
+    for answer in (prior, posterior):
+        check_posterior(answer, "plot_prior_posterior")
     plt = pyplot()
     wanted = [n if isinstance(n, tuple) else (n, ()) for n in names or _scalars(posterior)]
     if not wanted:
@@ -228,7 +232,7 @@ def _range(marginal: Marginal) -> tuple[float, float]:
     """The central part, with some room on both sides."""
     low, high = marginal.bounds(OUTSIDE)
     room = 0.08 * (high - low) or max(abs(low), 1.0) * 1e-2
-    return float(low - room), float(high + room)
+    return max(float(low - room), marginal.ends[0]), min(float(high + room), marginal.ends[1])
 
 
 def _common_range(before: Marginal, after: Marginal) -> tuple[float, float]:

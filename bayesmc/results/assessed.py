@@ -151,6 +151,7 @@ class AssessedByDraws(Assessed):
     model: Any
     weights: np.ndarray | None
     independent: bool
+    ancestors: np.ndarray | None
     ensemble_size: int
     _shape: tuple[int, int]
     _seen: dict[str, Any]
@@ -172,7 +173,9 @@ class AssessedByDraws(Assessed):
         return log_likelihood(problem.model, seen, stored, self._shape, chosen)
 
     def loo(self, *names: str) -> Elpd:
-        return leave_one_out(self._unweighted_likelihood("loo", names), self._relative_ess())
+        distinct = None if self.ancestors is None else len(np.unique(self.ancestors))
+        told = self._unweighted_likelihood("loo", names)
+        return leave_one_out(told, self._relative_ess(), distinct)
 
     def waic(self, *names: str) -> Elpd:
         return widely_applicable(self._unweighted_likelihood("waic", names))

@@ -72,8 +72,16 @@ class Elpd:
     __repr__ = __str__
 
 
-def leave_one_out(log_likelihood: Mapping[str, np.ndarray], r_eff: float) -> Elpd:
+#: draws that PSIS needs: a fifth of them, five at least, are the tail that is smoothed
+FEWEST = 25
+
+
+def leave_one_out(
+    log_likelihood: Mapping[str, np.ndarray], r_eff: float, distinct: int | None = None
+) -> Elpd:
     """PSIS-LOO of pointwise log likelihoods, each ``(chain, draw, ...)``; see ``Posterior.loo``.
+
+    ``distinct`` is how many draws are not copies of others, where some are.
 
     References
     ----------
@@ -83,11 +91,27 @@ def leave_one_out(log_likelihood: Mapping[str, np.ndarray], r_eff: float) -> Elp
     from arviz_stats.base import array_stats
 
     values = _columns("loo", log_likelihood)
-    elpd_i, k, p_i = (
-        np.asarray(part)
-        for part in array_stats.loo(values, chain_axis=-2, draw_axis=-1, r_eff=r_eff)
-    )
+    if not len(values):
+        raise QueryError("loo: no observation has a value; infer with observed data")
     count = values.shape[-1] * values.shape[-2]
+    if count < FEWEST:
+        raise QueryError(
+            f"loo: {count} draws are too few to smooth the tail of their weights; give {FEWEST} or more, "
+            "better some thousands: more draws of the engine, or resample(4000) of an exact answer"
+        )
+    with np.errstate(all="ignore"):  # tails of copies, which are refused below
+        elpd_i, k, p_i = (
+            np.asarray(part)
+            for part in array_stats.loo(values, chain_axis=-2, draw_axis=-1, r_eff=r_eff)
+        )
+    copies = distinct is not None and distinct < FEWEST
+    if copies or np.isnan(elpd_i).any():
+        told = f"{count} draws are copies of {distinct}" if distinct else "draws repeat each other"
+        raise QueryError(
+            f"loo: {told}, and the tail of their weights is the same few values over and over, which "
+            "cannot be smoothed; make the weights more equal (more draws, Importance with a proposal), or "
+            "infer with an engine of Markov chains: HamiltonianMonteCarlo, Gibbs"
+        )
     good_k = min(1 - 1 / np.log10(count), 0.7) if count > 1 else 0.7
     bad = int((k > good_k).sum())
     warning = ""

@@ -23,7 +23,7 @@ from bayesmc.resampling import systematic
 from bayesmc.results.assessed import AssessedByDraws
 from bayesmc.results.datatree import datatree
 from bayesmc.results.laws import DrawnLaws, Laws
-from bayesmc.results.marginal import Marginal
+from bayesmc.results.marginal import Marginal, ends_of
 from bayesmc.results.over_time import expanded
 from bayesmc.results.posterior import Posterior, quantile_levels, whole_draws
 from bayesmc.results.query import Query
@@ -215,7 +215,7 @@ class DrawsPosterior(AssessedByDraws, Posterior):
         draws = self._full(name, "marginal")
         flat = draws.reshape((math.prod(self._shape), *draws.shape[2:]))
         flat = flat[(slice(None), *(index if isinstance(index, tuple) else (index,)))]
-        return Marginal(name, flat, self._flat_weights())
+        return Marginal(name, flat, self._flat_weights(), ends=ends_of(node))
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
         count = math.prod(self._shape) if draws is None else whole_draws(draws)

@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution, Mixture
 from bayesmc.errors import UnsupportedError
+from bayesmc.network import CompiledNode
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +29,8 @@ class Marginal:
     distribution : Distribution or None
         The marginal itself, where it is known exactly: of a continuous node a ``Mixture`` of Gaussians, with
         the node's plates as batch.
+    ends : (float, float)
+        Of the support: kernel densities are reflected there, and 0 beyond.
 
     Examples
     --------
@@ -46,6 +49,7 @@ class Marginal:
     weights: np.ndarray
     states: tuple[Any, ...] | None = None
     distribution: Distribution | None = None
+    ends: tuple[float, float] = (-np.inf, np.inf)
 
     @property
     def probabilities(self) -> np.ndarray:
@@ -66,6 +70,8 @@ class Marginal:
     def density(self, points: Any, bandwidth: str | float = "scott") -> np.ndarray:
         """Density at ``points``: exact where it is known, else a kernel estimate on weighted draws.
 
+        At an end of the support kernels are reflected, so that none of their mass lies beyond.
+
         Parameters
         ----------
         points : array_like
@@ -74,7 +80,8 @@ class Marginal:
 
         References
         ----------
-        Scott, Multivariate Density Estimation (1992), sec. 6.5; Silverman (1986), eq. 3.31.
+        Scott, Multivariate Density Estimation (1992), sec. 6.5; Silverman (1986), eq. 3.31 and sec. 2.10
+        (reflection).
         """
         values = self._scalar("density")
         points = np.asarray(points, dtype=float)
@@ -82,12 +89,20 @@ class Marginal:
             return np.exp(self.distribution.log_prob(points))
         h = self._bandwidth(values, bandwidth)
         flat = points.ravel()
+        low, high = self.ends
+        places = [flat, *(2.0 * end - flat for end in self.ends if np.isfinite(end))]
+        total = sum(self._kernels(at, values, h) for at in places)
+        total = np.where((flat >= low) & (flat <= high), total, 0.0)
+        return (total / (h * np.sqrt(2 * np.pi))).reshape(points.shape)
+
+    def _kernels(self, flat: np.ndarray, values: np.ndarray, h: float) -> np.ndarray:
+        """Sums of weighted kernels, without their constant."""
         total = np.zeros(flat.shape)
         step = max(1, 2_000_000 // max(len(flat), 1))
         for start in range(0, len(values), step):
             z = (flat[:, None] - values[None, start : start + step]) / h
             total += np.exp(-0.5 * z * z) @ self.weights[start : start + step]
-        return (total / (h * np.sqrt(2 * np.pi))).reshape(points.shape)
+        return total
 
     def _exact_histogram(self, bins: Any, limits: Any, density: bool) -> tuple[Any, Any]:
         """Probabilities of bins, between the 0.1 % and 99.9 % quantiles where no range is given."""
@@ -145,6 +160,18 @@ class Marginal:
         if rule == "silverman":
             return float(spread * (0.75 * ess) ** (-1 / 5))
         raise ValueError(f"bandwidth={rule!r} is not 'scott', 'silverman' or a number")
+
+
+def ends_of(node: CompiledNode) -> tuple[float, float]:
+    """Between what each number of a node lies, whatever its parents are."""
+    support = node.support
+    if support is not None and support.kind == "simplex":
+        return 0.0, 1.0
+    if support is None or support.kind != "interval":
+        return -np.inf, np.inf
+    within = support.at_most
+    low, high = (float(np.asarray(end).flat[0]) for end in (within.low, within.high))
+    return low, high
 
 
 def gaussian_marginal(name: str, mixture: Mixture) -> Marginal:

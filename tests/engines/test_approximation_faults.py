@@ -237,10 +237,106 @@ def test_equal_readings_of_a_scale_are_refused_or_told() -> None:
     net.add("y", lambda m, s: bmc.Normal(m, s), plates="i")
     with pytest.raises(UnsupportedError, match="node 's' runs off"):
         bmc.infer(net, {"y": np.ones(6)}, engine=bmc.MeanField(restarts=1), rng=0)
-    with pytest.warns(ConvergenceWarning, match="6 factors have no integral.*all equal"):
+    with pytest.raises(UnsupportedError, match="node 'm' narrows without end.*'y'.*all equal"):
         bmc.infer(net, {"y": np.ones(6)}, engine=EP())
     near = bmc.infer(net, {"y": 1.0 + 1e-9 * np.arange(6)}, engine=bmc.MeanField(restarts=1), rng=0)
     assert 1e-10 < near.mean("s") < 1e-7  # small, and what the readings say
+
+
+def test_scales_that_a_prior_keeps_from_zero_are_answered() -> None:
+    """Equal readings, but a posterior with an integral."""
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("m", bmc.Normal(0.0, 3.0))
+    net.add("s", bmc.InverseGamma(2.0, 1.0))
+    net.add("y", lambda m, s: bmc.Normal(m, s), plates="i")
+    assert bmc.infer(net, {"y": np.ones(6)}, engine=EP()).converged
+
+
+# ---- densities that jump ------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mean", "seen", "jumps"),
+    [
+        (
+            lambda a: np.where(a > 300.0, a, 0.0),
+            400.0,
+            True,
+        ),  # the climb ends at 0, on the wrong side
+        (lambda a: np.where(a > 100.0, a, 0.0), 150.0, True),
+        (lambda a: np.where(a > 30.0, a, 30.0), 150.0, False),  # a bend
+        (lambda a: np.where(a > 900.0, 0.0, a), 40.0, False),  # nothing is behind it
+    ],
+)
+def test_modes_beside_a_jump_are_refused(mean: Any, seen: float, jumps: bool) -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 100.0))
+    net.add("y", lambda a: bmc.Normal(mean(a), 1.0))
+    asked = (
+        lambda: bmc.infer(net, {"y": seen}, engine=bmc.LaplaceApproximation()).mean("a"),
+        lambda: bmc.map(net, {"y": seen})["a"],
+    )
+    for ask in asked:
+        if jumps:
+            with pytest.raises(UnsupportedError, match="jumps at some values of node 'a'"):
+                ask()
+        else:
+            assert abs(float(ask()) - seen) < 0.1
+
+
+def test_what_is_known_settles_a_jump() -> None:
+    net = bmc.BayesNet()
+    net.add("k", bmc.Normal(0.0, 1.0))
+    net.add("a", bmc.Uniform(0.0, 10.0))
+    net.add("y", lambda a, k: bmc.Normal(np.where(k > 0.0, a, -a), 0.1))
+    seen = {"y": 5.0, "k": 1.0}
+    found = bmc.infer(net, seen, engine=bmc.LaplaceApproximation()).mean("a")
+    assert abs(found - 5.0) < 0.01
+    with pytest.raises(UnsupportedError, match="jumps at some values of node 'k'"):
+        bmc.map(net, {"y": 5.0})
+
+
+def test_a_comparison_that_cuts_the_gaussian_of_a_mode_is_refused() -> None:
+    """The Gaussian would have half of its mass where the density is zero."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(1.0, 1.0))
+    net.add("far", bmc.Normal(50.0, 1.0))
+    net.add("up", lambda a: bmc.Bernoulli(a > 0.0))
+    net.add("away", lambda far: bmc.Bernoulli(far > 0.0))
+    with pytest.raises(UnsupportedError, match="zero beyond some values of node 'a' near its mode"):
+        bmc.infer(net, {"up": 1, "away": 1}, engine=bmc.LaplaceApproximation())
+    found = bmc.infer(net, {"away": 1}, engine=bmc.LaplaceApproximation())
+    assert abs(found.mean("far") - 50.0) < 1e-6
+
+
+# ---- states that are chosen ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("link", [special.ndtr, special.expit])
+def test_grades_as_a_stack_of_probabilities(link: Any) -> None:
+    """Ordinal regression, where the observed state chooses among unlike functions of one number."""
+    x = np.linspace(-2.0, 2.0, 12)
+    grade = np.array([0, 0, 1, 0, 1, 1, 2, 1, 2, 1, 2, 2])
+
+    def graded(b: Any) -> bmc.Categorical:
+        low, high = link(-0.5 - b * x), link(0.7 - b * x)
+        return bmc.Categorical(np.stack([low, high - low, 1.0 - high], axis=-1))
+
+    net = bmc.BayesNet(plates={"row": 12})
+    net.add("b", bmc.Normal(0.0, 2.0))
+    net.add("grade", graded, plates="row")
+    found = bmc.infer(net, {"grade": grade}, engine=EP())
+    b = np.linspace(-4.0, 12.0, 8001)
+    log = graded(b[:, None]).log_prob(grade).sum(axis=-1) + bmc.Normal(0.0, 2.0).log_prob(b)
+    weights = np.exp(log - log.max())
+    total = weights.sum()
+    mean = weights @ b / total
+    sd = np.sqrt(weights @ (b - mean) ** 2 / total)
+    assert found.converged
+    assert abs(found.mean("b") - mean) < 0.02 * sd
+    assert abs(found.std("b") / sd - 1.0) < 0.06
+    evidence = np.log(total * (b[1] - b[0])) + log.max()
+    assert abs(found.log_marginal_likelihood - evidence) < 0.05
 
 
 def test_errors_say_which_engine_was_asked() -> None:

@@ -420,7 +420,7 @@ def test_options() -> None:
     )
     net = bmc.BayesNet()
     net.add("x", bmc.Normal(0.0, 1.0))
-    with pytest.raises(UnsupportedError, match="make it anew"):
+    with pytest.raises(UnsupportedError, match="give it anew"):
         bmc.infer(net, engine=lost)
 
 

@@ -122,7 +122,7 @@ def test_answers_over_time_travel_without_functions(name: str, question: str) ->
         with pytest.raises(bmc.errors.QueryError, match="pickle"):
             again.pairs(node)
     if name == "particles":
-        with pytest.raises(bmc.errors.UnsupportedError, match="unpickled"):
+        with pytest.raises(bmc.errors.UnsupportedError, match="hold no functions"):
             bmc.filter(make(), Y, engine=again.engine)
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import bayesmc as bmc
-from bayesmc.errors import ConvergenceWarning, ModelError, UnsupportedError
+from bayesmc.errors import ConvergenceWarning, EvidenceError, ModelError, UnsupportedError
 
 
 def counts() -> bmc.BayesNet:
@@ -149,3 +149,46 @@ def test_a_climb_cut_short_says_so() -> None:
         start = {"q": 4.0, "r": 0.05}
         found = bmc.fit(walk(), {"y": walked()}, start=start, max_iterations=1, tolerance=1e3)
     assert not found.converged or len(found.history) < 4
+
+
+def line(x: np.ndarray, z: np.ndarray) -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"i": len(x)})
+    net.add("b", bmc.Normal(0.0, 5.0))
+    net.add("c", bmc.Normal(0.0, 5.0))
+    net.add("s", bmc.HalfNormal(2.0))
+    net.add("y", lambda b, c, s: bmc.Normal(b * x + c * z, s), plates="i")
+    return net
+
+
+def test_what_the_data_do_not_tell_is_named() -> None:
+    rng = np.random.default_rng(0)
+    x, z = rng.normal(size=(2, 30))
+    y = 3 * x + rng.normal(size=30)
+    with pytest.warns(ConvergenceWarning, match="flat in b with c:"):
+        found = bmc.fit(line(x, 2 * x), {"y": y})
+    assert not found.converged and np.isfinite(found.std_errors["s"])
+    assert np.isnan([found.std_errors["b"], found.std_errors["c"]]).all()
+    assert bmc.fit(line(x, z), {"y": y}).converged  # without a warning
+    assert bmc.fit(line(x, 2 * x + 0.01 * z), {"y": y}).converged  # hard to tell, and told
+
+    net = bmc.BayesNet(plates={"i": 30})
+    net.add("b", bmc.Normal(0.0, 5.0))
+    net.add("y", lambda b: bmc.Bernoulli(logits=b * x), plates="i")
+    with pytest.warns(ConvergenceWarning, match="flat in b: .* off to infinity"):
+        assert not bmc.fit(net, {"y": (x > 0).astype(int)}).converged
+    with pytest.warns(ConvergenceWarning, match="flat in q"):
+        bmc.fit(walk(), {"y": [1.3]})
+
+
+def test_errors_do_not_depend_on_units() -> None:
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("m", bmc.Normal(0.0, 1000.0))
+    net.add("y", lambda m: bmc.Normal(m, 1000.0), plates="i")
+    found = bmc.fit(net, {"y": [100.0, 2000.0, -500.0, 400.0]})
+    assert found["m"] == pytest.approx(500.0) and found.std_errors["m"] == pytest.approx(500.0)
+
+
+def test_nothing_observed_is_refused() -> None:
+    for net, data in ((counts(), {"count": [None] * 4}), (walk(), {"y": [np.nan] * 3})):
+        with pytest.raises(EvidenceError, match="nothing is observed"):
+            bmc.fit(net, data)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import optimize
 
 import bayesmc as bmc
 from bayesmc.errors import (
@@ -219,3 +220,36 @@ def test_extrapolated_steps_end_where_plain_ones_do() -> None:
     assert (
         maximised(cases.expected, plain, counts, 1e-10, 5).history[-1] >= learned.history[-1] - 1e-8
     )
+
+
+def test_a_series_with_gaps_is_learned_as_direct_maximisation_learns_it() -> None:
+    """Gaps in what nobody reads count for nothing: the optimum of the forward algorithm's likelihood."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("mood", ["mood_prev"], [[0.7, 0.3], [0.4, 0.6]], initial=[0.5, 0.5])
+    dbn.table("noise", ["mood"], [[0.7, 0.3], [0.2, 0.8]])
+    rows: list[Any] = ([0] * 12 + [1] * 8) * 5
+    rows[7] = rows[14] = rows[50] = None
+    found = bmc.fit(dbn, {"noise": rows}, tolerance=1e-9)
+    assert found.converged and (np.diff(found.history) > -1e-9).all()
+
+    def loss(u: np.ndarray) -> float:
+        p = 1 / (1 + np.exp(-u))
+        move, shown = (np.stack([1 - q, q], axis=-1) for q in (p[1:3], p[3:]))
+        belief, total = np.array([1 - p[0], p[0]]), 0.0
+        for t, row in enumerate(rows):
+            belief = belief @ move if t else belief
+            joint = belief if row is None else belief * shown[:, row]
+            total += np.log(joint.sum())
+            belief = joint / joint.sum()
+        return -total
+
+    best = optimize.minimize(loss, [-1.0, -2.0, 2.0, -1.0, 1.0], options={"gtol": 1e-4})
+    assert found.log_likelihood == pytest.approx(-best.fun, abs=1e-4)
+    p = 1 / (1 + np.exp(-best.x))
+    learned = [found["mood"][:, 1], found["noise"][:, 1]]
+    np.testing.assert_allclose(np.ravel(learned), p[1:], atol=2e-3)
+
+
+def test_nothing_observed_is_no_series_to_learn_from() -> None:
+    with pytest.raises(EvidenceError, match="nothing is observed"):
+        bmc.fit(umbrella(), {"o": [None, None, None]})

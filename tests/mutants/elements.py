@@ -109,7 +109,7 @@ MUTANTS = [
     ),
     Mutant(
         "weights of a guided pose are without p/q",
-        (Edit(GUIDE, "return log_p - log_q,", "return 0.0 * log_p,"),),
+        (Edit(GUIDE, "return log_p - log_q + more,", "return 0.0 * log_p + more,"),),
         lambda seed: unbiased(seed, False, "optimal"), BY,
     ),
     Mutant(

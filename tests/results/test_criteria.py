@@ -208,3 +208,19 @@ def test_mesquite_bushes_are_ranked_as_known(reference_data: Path) -> None:
     }
     for name, elpd in known.items():
         assert table[name]["elpd"] == pytest.approx(elpd, abs=0.4)
+
+
+def test_loo_of_too_few_draws_or_copies_is_refused_by_name() -> None:
+    net = bmc.BayesNet(plates={"day": 5})
+    net.add("mean", bmc.Normal(0.0, 10.0))
+    net.add("y", lambda mean: bmc.Normal(mean, 1.0), plates="day")
+    seen = {"y": [0.1, 1.4, -0.3, 0.8, 0.5]}
+    with pytest.raises(QueryError, match="20 draws are too few"):
+        bmc.infer(net, seen).resample(20, rng=0).loo()
+    for draws in (100, 300):  # worth 8 and 24
+        with pytest.warns(LowEssWarning):
+            weighted = bmc.infer(net, seen, engine=bmc.LikelihoodWeighting(draws), rng=0)
+        with pytest.raises(QueryError, match="4000 draws are copies of"):
+            weighted.resample(4000, rng=0).loo()
+    enough = bmc.infer(net, seen, engine=bmc.LikelihoodWeighting(20_000), rng=0)
+    assert enough.resample(4000, rng=0).loo().elpd == pytest.approx(-6.2, abs=0.3)

@@ -14,7 +14,12 @@ from bayesmc.engines.approximate.evidence import log_constants, why_not
 from bayesmc.engines.approximate.free_gaussian import FreeGaussian
 from bayesmc.engines.approximate.modes import Mode, NoMode, modes_of
 from bayesmc.engines.approximate.posterior import DRAWS, ApproximatePosterior
-from bayesmc.engines.approximate.question import free_density, linear_below, start_points
+from bayesmc.engines.approximate.question import (
+    free_density,
+    linear_below,
+    refuse_jumps,
+    start_points,
+)
 from bayesmc.engines.base import Engine
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import ConvergenceWarning, UnsupportedError
@@ -75,8 +80,9 @@ class LaplaceApproximation(Engine):
     Raises
     ------
     UnsupportedError
-        A density cannot be followed or has no gradient, a hidden node is discrete without finite states, no
-        climb found a mode: what stands in the way is named, such as a ridge with its directions.
+        A density cannot be followed or has no gradient, or jumps within reach of the mode or of draws of the
+        prior, a hidden node is discrete without finite states, no climb found a mode: what stands in the way
+        is named, such as a ridge with its directions.
 
     Warns
     -----
@@ -161,6 +167,7 @@ class LaplaceApproximation(Engine):
         if not found:
             raise UnsupportedError(_without_mode(density, lost))
         found = sorted(found, key=lambda mode: -mode.log_volume)
+        refuse_jumps(density, found[0], type(self).__name__, edges=True)
         constant = log_constants(density.target)
         _warn(density, found, lost, constant)
         best = found[0]

@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.modes import Mode, NoMode, modes_of
-from bayesmc.engines.approximate.question import free_density, is_number, start_points
+from bayesmc.engines.approximate.question import free_density, is_number, refuse_jumps, start_points
 from bayesmc.engines.mcmc.given import read_start
 from bayesmc.errors import BayesmcError, ConvergenceWarning, UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
@@ -112,9 +112,9 @@ def map(  # noqa: A001 - the name that everybody knows it by
     Raises
     ------
     UnsupportedError
-        A density cannot be followed or has no gradient; a hidden node is discrete without finite states, or
-        all are finite; no climb found a mode, with what it met by name (a ridge, a density that rises without
-        end) and how far a step would still have gone.
+        A density cannot be followed or has no gradient, or jumps; a hidden node is discrete without finite
+        states, or all are finite; no climb found a mode, with what it met by name (a ridge, a density that
+        rises without end) and how far a step would still have gone.
 
     Warns
     -----
@@ -149,6 +149,7 @@ def map(  # noqa: A001 - the name that everybody knows it by
         best = max(lost, key=lambda end: end.log_density)
         raise UnsupportedError(f"map: {best.reason} (the same of {len(lost)} climbs, or worse)")
     best_mode = found[0]
+    refuse_jumps(density, best_mode, "map")
     _warn(best_mode, lost)
     return PosteriorMode(
         _values(target, density, best_mode),

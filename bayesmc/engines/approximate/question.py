@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.approximate.modes import Mode
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.network.expressions import Followed, density
 from bayesmc.structure.affine import NotLinearError, is_hidden, linear_node
 from bayesmc.structure.free_density import UnconstrainedDensity
-from bayesmc.structure.jumps import jumps
+from bayesmc.structure.jumps import jumps, spread_points
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import unconstrained_density
 
@@ -21,6 +23,11 @@ from bayesmc.structure.unconstrained import unconstrained_density
 _MOST = 2000
 #: starts are the same whatever the seed of the draws: a mode is no matter of chance
 _SEED = 20260
+#: points between which a jump is looked for, and how far out they are: from the mode and from draws of the
+#: prior in standard deviations, and where a jump counts by what is behind it
+_POINTS, _REACH, _FAR = 96, 2.0, 6.0
+#: difference in the log density from the mode from which on nothing is missed
+_NEGLIGIBLE = 30.0
 
 
 def is_number(problem: Problem, name: str) -> bool:
@@ -81,6 +88,36 @@ def start_points(
     return np.unique(found[finite], axis=0) if finite.any() else np.zeros((1, density.size))
 
 
+def refuse_jumps(density: UnconstrainedDensity, mode: Mode, who: str, edges: bool = False) -> None:
+    """Refuse a density that jumps around its mode, or on the way from there to where the prior has mass.
+
+    Climbs do not see it: the other side may be higher, and its gradient does not tell. Far from the mode
+    jumps count where the density beside or behind them is not negligible. With ``edges`` a density is
+    refused, too, that is zero beyond some values near the mode, which a Gaussian there does not know of.
+
+    Raises
+    ------
+    UnsupportedError
+        Names the node.
+    """
+    rng = np.random.default_rng(density.size)
+    z = _REACH * rng.standard_normal((density.size, _POINTS))
+    near = mode.u + scipy.linalg.solve_triangular(mode.root.T, z).T
+    try:
+        _refuse(jumps(density, near, near))
+        cut = jumps(density, near, near, to_zero=True) if edges else ()
+        if cut:
+            raise UnsupportedError(
+                f"the density is zero beyond some values of node {min(cut)!r} near its mode (an observed "
+                "comparison, or bounds that depend on other nodes), where a Gaussian there has mass; use "
+                "ExpectationPropagation, Gibbs or HamiltonianMonteCarlo"
+            )
+        least = mode.log_density - _NEGLIGIBLE
+        _refuse(jumps(density, mode.u[None], _drawn(density, _FAR), above=least))
+    except UnsupportedError as error:
+        raise UnsupportedError(f"{who}: {error}") from error
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -95,13 +132,27 @@ def _made(target: Target, who: str) -> UnconstrainedDensity:
         raise UnsupportedError(
             f"node {name!r} is to be summed out, and the bounds of a continuous node depend on it; use Gibbs"
         )
-    jumping = sorted(jumps(density))
+    drawn = _drawn(density)
+    for jumping in (jumps(density), jumps(density, drawn, drawn)):
+        _refuse(jumping)
+    return density
+
+
+def _refuse(jumping: frozenset[str]) -> None:
     if jumping:
         raise UnsupportedError(
-            f"the density jumps at some values of node {jumping[0]!r}, so that its curvature tells nothing; "
-            "use Gibbs or MetropolisHastings"
+            f"the density jumps at some values of node {min(jumping)!r}, so that its curvature tells "
+            "nothing; use Gibbs or MetropolisHastings"
         )
-    return density
+
+
+def _drawn(density: UnconstrainedDensity, reach: float = _REACH) -> np.ndarray:
+    """Free numbers of the states on which functions are compared, spread out."""
+    states = density.target.states
+    if states is None:
+        return np.empty((0, density.size))
+    values, rng = {**density.target.known, **states}, np.random.default_rng(density.size)
+    return spread_points(density.nodes, values, rng, _POINTS, reach)
 
 
 def _nothing(target: Target) -> str:

@@ -51,6 +51,16 @@ def spreads(bounds: Sequence[Bounds], beliefs: Beliefs) -> list[np.ndarray]:
     return found
 
 
+def deviations(beliefs: Beliefs) -> np.ndarray:
+    """Standard deviations of all coordinates."""
+    found = np.full(len(beliefs.size), np.nan)
+    for size in np.unique(beliefs.size):
+        mine = np.flatnonzero(beliefs.size == size)
+        var = beliefs.blocks[size].cov.diagonal(0, -2, -1)
+        found[mine] = np.sqrt(var[beliefs.component[mine], beliefs.place[mine]])
+    return found
+
+
 def are_squeezed(before: Sequence[np.ndarray], after: Sequence[np.ndarray]) -> bool:
     """Whether some direction has next to no room left."""
     pairs = zip(before, after, strict=True)

@@ -23,6 +23,7 @@ from bayesmc.expression import (
     Elementwise,
     Expression,
     Program,
+    as_expression,
     broadcast,
     elementwise,
 )
@@ -127,8 +128,9 @@ class Terms:
         scope, values, cards = self.configured(
             name, plates, parents, inner.residual, inner.combinations
         )
+        told = self._told(inner.residual)
         for called, form in zip(inner.names, inner.combinations, strict=True):
-            _hold_aligned(inner.residual, called, form, shape, values)
+            _hold_aligned(told, called, form, shape, values)
         places = tuple((n, own[at]) for n, own in scope)
         if not inner.combinations:
             (logs,) = Program([inner.residual])(values)
@@ -292,6 +294,16 @@ class Terms:
         rows = np.arange(len(at))[:, None]
         np.add.at(target, (rows, entry[None, :], column), np.where(where < 0, 0.0, flat))
         return offset, full_gain, coordinates
+
+    def _told(self, root: Expression) -> Expression:
+        """With the known states in place: what is chosen by them is then an element, not any of several."""
+        model = self.model
+        states = {
+            n: as_expression(np.broadcast_to(self.known[n], model[n].value_shape))
+            for n in root.leaves & self.known.keys()
+            if model[n].domain is not None
+        }
+        return _with(root, states) if states else root
 
     def _hold(
         self,

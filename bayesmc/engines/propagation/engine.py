@@ -68,7 +68,7 @@ class ExpectationPropagation(MessageEngine, SeriesPropagation):
     shorter and rows are visited in parts, in turn; where the damping is all that slows them it is left out.
     Where a move would leave a belief without an integral it is shortened. Quotients of Gaussians may have no
     finite integral: a factor whose product with its cavity has none is left out, and counted in ``skipped``;
-    as long as some are, nothing has settled.
+    as long as some are, nothing has settled. Beliefs that narrow without end beside them are refused by name.
 
     Over time a slice and the one before, with both messages that come from outside, are a mixture over pairs
     of modes; it is collapsed to the belief of the same means and covariances in each mode, and what came from

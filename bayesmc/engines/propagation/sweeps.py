@@ -20,16 +20,19 @@ from bayesmc.engines.propagation.contradiction import (
     are_squeezed,
     bounds_of,
     contradictory,
+    deviations,
     spreads,
 )
 from bayesmc.engines.propagation.lines import LineBatch
 from bayesmc.engines.propagation.pace import Pace
 from bayesmc.engines.propagation.system import System
-from bayesmc.errors import ZeroProbabilityError
+from bayesmc.errors import UnsupportedError, ZeroProbabilityError
 from bayesmc.structure.target import target_of
 
 #: probabilities below this do not count as changed
 _TINY = 1e-12
+#: a belief that is narrower than it was by this factor, with messages that are open, has run off
+_GONE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ def settle(
         return Settled(True, 0, 0.0, 0, 0, _evidence(system), 0.0, pace.share)
     bounds = [b for b in map(bounds_of, batches) if b is not None]
     room = spreads(bounds, beliefs)
+    wide = deviations(beliefs)
     after = _marginals(beliefs)
     while done < sweeps:
         before = after
@@ -119,6 +123,8 @@ def settle(
     total = np.nan if left and not settled else _evidence(system)
     if not settled or np.isnan(total) or are_squeezed(room, spreads(bounds, beliefs)):
         _refuse_contradictory(bounds)
+    if left and change <= tolerance:  # at rest, without the messages that are open
+        _refuse_endless(system, [b.name for b, n in skips if n], wide)
     silent = _silent([b for b, n in skips if n]) if left else {}
     return Settled(
         settled, done, float(change), skipped, left, total, error, pace.share, silent=silent
@@ -253,6 +259,25 @@ def _refuse_contradictory(bounds: Sequence[Bounds]) -> None:
             f"{', '.join(map(repr, names[:6]))} contradicts itself, since no numbers satisfy all of these "
             "comparisons"
         )
+
+
+def _refuse_endless(system: System, names: Sequence[str], wide: np.ndarray) -> None:
+    """Beliefs that narrowed to nothing while factors had no integral with them."""
+    now = deviations(system.beliefs)
+    for name, x in system.numbers.items():
+        at = x.at[x.at >= 0]
+        ratio = now[at] / wide[at]
+        if (~(ratio > _GONE)).any():
+            least = now[at][~(ratio > _GONE)][0]
+            factors = ", ".join(map(repr, dict.fromkeys(names)))
+            raise UnsupportedError(
+                f"ExpectationPropagation: what is believed of node {name!r} narrows without end (its "
+                f"standard deviation has come to {least:.2g}), and factors of {factors} have no integral "
+                "with it. Either the posterior has no integral, or next to all of its mass at the edge of a "
+                "support, as with a scale whose readings are all equal: give the scale a prior that vanishes "
+                "there (LogNormal, InverseGamma), or the readings the noise of their rounding. Or messages "
+                "do not find it, under very vague priors above all: give narrower ones, or take Gibbs"
+            )
 
 
 def _refuse_impossible(system: System, at_all: bool = False) -> None:

@@ -8,57 +8,35 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.transforms import Identity, Wrapped
 from bayesmc.engines.variational.factors import State
 from bayesmc.engines.variational.free import FREE, FreeFactor
 from bayesmc.engines.variational.steps import Plan, total_of
 from bayesmc.errors import UnsupportedError
-from bayesmc.structure.jumps import jumps_between
+from bayesmc.structure.jumps import nodes_that_jump, spread_points
 
-#: ways that each node is moved, and how far, in standard deviations of a draw
-_WAYS, _REACH = 24, 2.0
+#: points between which nodes are moved, and how far out they are, in standard deviations of a draw
+_POINTS, _REACH = 96, 2.0
 #: how far from 0, and from all draws of the prior, there is no end in sight of a climb of a bounded number
 _ENDLESS = 100.0
+_JUMP = (
+    "MeanField: the density jumps at some values of node {!r}, which the normal factor that it has without a "
+    "closed form does not see as it climbs; use Gibbs() or MetropolisHastings()"
+)
+_EDGE = (
+    "MeanField: the density is zero beyond some values of node {!r} (an observed comparison, or bounds that "
+    "depend on other nodes), in front of which a normal factor would be squeezed; use "
+    "ExpectationPropagation(), Gibbs() or HamiltonianMonteCarlo()"
+)
 
 
-def refuse_jumps(plan: Plan, state: State) -> None:
+def refuse_jumps(plan: Plan, state: State, edges: bool = False) -> None:
     """Refuse an energy that jumps within reach of the normal factor, or of draws of the prior.
 
-    Found by trying: what each node is moved past, the others at random places.
-
-    Raises
-    ------
-    UnsupportedError
-        Names the node.
-    """
-    free = plan.free
-    if free is None:
-        return
-    root = total_of(s.total for s in plan.sums)
-    rng = np.random.default_rng(free.size)
-    own = {name: value for name, value in state.items() if name != FREE}
-    for points in (_reached(free, rng), _drawn(plan, free, rng)):
-        if len(points) < 2:
-            continue
-        for node in free.nodes:
-            low, high = (points[rng.integers(len(points), size=_WAYS)] for _ in range(2))
-            numbers = slice(node.start, node.start + node.size)
-            ways = low.copy()
-            ways[:, numbers] = high[:, numbers]
-            if jumps_between(root, FREE, own, low, ways).any():
-                raise UnsupportedError(
-                    f"MeanField: the density jumps at some values of node {node.name!r}, which the normal "
-                    "factor that it has without a closed form does not see as it climbs; use Gibbs() or "
-                    "MetropolisHastings()"
-                )
-
-
-def refuse_edges(plan: Plan, state: State) -> None:
-    """Refuse a density that is zero beyond some values of a free number, where draws of the prior lie.
-
-    A normal factor has mass beyond any edge, where the bound is minus infinity: what it climbs is a sum over
-    a few points, and it shrinks until these are inside.
+    Found by trying: what each node is moved past, the others at random places. With ``edges`` a density that
+    is zero beyond some values, where draws of the prior lie, is refused, too: a normal factor has mass beyond
+    any edge, where the bound is minus infinity, and what it climbs is a sum over a few points, which shrinks
+    until these are inside.
 
     Raises
     ------
@@ -72,19 +50,13 @@ def refuse_edges(plan: Plan, state: State) -> None:
     rng = np.random.default_rng(free.size)
     own = {name: value for name, value in state.items() if name != FREE}
     reached, drawn = _reached(free, rng), _drawn(plan, free, rng)
-    if not len(drawn):
-        return
-    for node in free.nodes:
-        low = reached[rng.integers(len(reached), size=_WAYS)]
-        high = low.copy()
-        numbers = slice(node.start, node.start + node.size)
-        high[:, numbers] = drawn[rng.integers(len(drawn), size=_WAYS)][:, numbers]
-        if jumps_between(root, FREE, own, low, high, to_zero=True).any():
-            raise UnsupportedError(
-                f"MeanField: the density is zero beyond some values of node {node.name!r} (an observed "
-                "comparison, or bounds that depend on other nodes), in front of which a normal factor would "
-                "be squeezed; use ExpectationPropagation(), Gibbs() or HamiltonianMonteCarlo()"
-            )
+    ways = [(reached, reached, False), (drawn, drawn, False)]
+    if edges:
+        ways.append((reached, drawn, True))
+    for low, high, to_zero in ways:
+        found = nodes_that_jump(root, FREE, own, free.nodes, low, high, to_zero=to_zero)
+        if found:
+            raise UnsupportedError((_EDGE if to_zero else _JUMP).format(found[0]))
 
 
 def refuse_endless(plan: Plan) -> None:
@@ -122,7 +94,7 @@ def refuse_endless(plan: Plan) -> None:
 
 
 def _reached(free: FreeFactor, rng: np.random.Generator) -> np.ndarray:
-    return free.placed(_REACH * rng.standard_normal((4 * _WAYS, free.size)))
+    return free.placed(_REACH * rng.standard_normal((_POINTS, free.size)))
 
 
 def _drawn(plan: Plan, free: FreeFactor, rng: np.random.Generator) -> np.ndarray:
@@ -130,17 +102,4 @@ def _drawn(plan: Plan, free: FreeFactor, rng: np.random.Generator) -> np.ndarray
     states, known = plan.target.states, dict(plan.target.known)
     if states is None:
         return np.empty((0, free.size))
-    with marking_invalid(), np.errstate(all="ignore"):
-        parts = []
-        for node in free.nodes:
-            value = np.asarray(states[node.name], float)
-            parts.append(np.reshape(node.freed(value, {**known, **states}), (len(value), -1)))
-    u = np.concatenate(parts, axis=1)
-    u = u[np.isfinite(u).all(axis=1)]
-    if len(u) < 2:
-        return u
-    rows = rng.integers(len(u), size=(4 * _WAYS, 1))
-    spread = _REACH * (0.1 + u.std(axis=0))
-    return np.take_along_axis(u, np.broadcast_to(rows, (4 * _WAYS, free.size)), 0) + spread * (
-        rng.standard_normal((4 * _WAYS, free.size))
-    )
+    return spread_points(free.nodes, {**known, **states}, rng, _POINTS)

@@ -16,7 +16,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.variational.ascent import Ascent, best_of
 from bayesmc.engines.variational.excluded import left_out
 from bayesmc.engines.variational.free import FREE, finer_rule, fresh_points
-from bayesmc.engines.variational.jumping import refuse_edges, refuse_endless, refuse_jumps
+from bayesmc.engines.variational.jumping import refuse_endless, refuse_jumps
 from bayesmc.engines.variational.parts import Part, TablePart, part_of
 from bayesmc.engines.variational.places import other_places, told
 from bayesmc.engines.variational.plan import plan_for
@@ -366,8 +366,7 @@ def measured(
     scrambled sequences.
     """
     assert plan.free is not None
-    refuse_jumps(plan, best.state)
-    refuse_edges(plan, best.state)
+    refuse_jumps(plan, best.state, edges=True)
     free = plan.free
     entropy = sum(f.entropy(best.state) for f in plan.factors) + constant
 
