@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn.calendar import is_even, uneven_at
+from bayesmc.dbn.given import check_frame
 from bayesmc.dbn.slices import TIME, Template
 from bayesmc.errors import EvidenceError
 from bayesmc.network.columns import clock, columns_of, is_dated, is_frame, is_text
@@ -251,6 +252,8 @@ def _check_indexes(template: Template, observations: Any, inputs: Any) -> None:
                 continue
             if is_frame(value) and name == what and _is_told(what, template, value):
                 continue
+            if value is not data:
+                check_frame(f"{what} of {name!r}", value)
             own = list(_index(value))
             other, before = seen = seen or (name, own)
             count = min(len(own), len(before))
