@@ -195,6 +195,20 @@ class Peer(Worker):
         return SelfTimed(lambda: sum(self.seconds(one) for one in evidence))
 
 
+def peer_answer(script: str, question: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What a script of ``peers/`` answers, JSON for JSON; None without the peers, or if it fails."""
+    python = peer_python()
+    if python is None:
+        return None
+    command = [str(python), str(HERE / "peers" / script)]
+    done = subprocess.run(command, input=json.dumps(question), capture_output=True, text=True)
+    if done.returncode:
+        print(f"the peer's {question['job']} failed: {done.stderr.strip().splitlines()[-1]}")
+        return None
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
+
+
 def peer_python() -> Path | None:
     """The Python of the peers' environment (``BAYESMC_PEERS``, else ``.venv-peers``), if there."""
     folder = Path(os.environ.get("BAYESMC_PEERS", HERE.parent / ".venv-peers"))
