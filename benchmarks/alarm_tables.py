@@ -1,8 +1,8 @@
 """ALARM's tables from cases with entries missing, beside pyAgrum's EM: the same start, the same iterates.
 
 What EM ends at follows from where it starts, iterate by iterate. Both begin with the tables of the net,
-without a prior, and pyAgrum without the noise that it adds by itself; where their iterates are the same, so are
-their ends, and how many plain iterations lead there can be counted without waiting for the peer.
+without a prior, and pyAgrum without the noise that it adds by itself; where their iterates are the same, so
+are their ends, and how many plain iterations lead there can be counted without waiting for the peer.
 
 pyAgrum watches the expected log likelihood of completed cases in place of the log likelihood, and ends where
 that falls, which may be before an optimum.
@@ -105,12 +105,12 @@ def _same_map(
 ) -> str:
     head = [
         "cases",
-        f"iterate {COMPARED} differs by",
-        "from our optimum it rises",
-        "EM's end less ours",
+        f"iterate {COMPARED} off by",
+        "rises from our end",
+        "its end less ours",
         f"iterations to {NEAR:g}",
-        "pyAgrum, CPU s each",
-        "CPU s for these",
+        "CPU s each",
+        "all of them",
         "over ours",
     ]
     rows: list[list[object]] = []
@@ -132,9 +132,7 @@ def _same_map(
         each = first["cpu_seconds"] / (COMPARED + 1)
         row += [f"{apart:.1e}", f"{rise:+.1e}", f"{short:+.1e}", needed, each]
         rows.append(row + [needed * each, needed * each / spent[count]])
-    title = (
-        f"pyAgrum's EM from the same tables: its iterates, and how many to {NEAR:g} nats of its end"
-    )
+    title = f"plain EM from the same tables by pyAgrum: what it costs to come within {NEAR:g} nats of its end"
     return table(title, head, rows)
 
 
