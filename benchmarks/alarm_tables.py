@@ -79,7 +79,7 @@ def main(cases: int, whole: bool = False) -> None:
     title = (
         f"ALARM's tables, {GAPS:.0%} of the entries missing: bmc.fit (pgmpy's EM drops such cases)"
     )
-    print(table(title, head, [[n, *row[1:]] for n, row in found.items()]) + "\n")
+    print(table(title, head, [[n, *row[1:]] for n, row in found.items()]) + "\n", flush=True)
     fits = {count: row[0] for count, row in found.items()}
     print(_same_map(asked, fits, {n: row[4] for n, row in found.items()}) + "\n")
     print(_same_likelihood(asked, fits) + "\n")

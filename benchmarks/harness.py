@@ -186,6 +186,10 @@ class Peer(Worker):
         """Seconds for one run with this evidence."""
         return float(self.ask(evidence=dict(evidence), answer=False)["seconds"])
 
+    def cpu_seconds(self, evidence: Mapping[str, str]) -> float:
+        """The same in seconds of its process, which other processes do not stretch."""
+        return float(self.ask(evidence=dict(evidence), answer=False)["cpu_seconds"])
+
     def marginals(self, evidence: Mapping[str, str]) -> dict[str, dict[str, float]]:
         """The peer's answer: node to state label to probability."""
         return self.ask(evidence=dict(evidence), answer=True)["marginals"]
