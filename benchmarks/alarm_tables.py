@@ -5,7 +5,7 @@ without a prior, and pyAgrum without the noise that it adds by itself; where the
 are their ends, and how many plain iterations lead there can be counted without waiting for the peer.
 
 pyAgrum watches the expected log likelihood of completed cases in place of the log likelihood, and ends where
-that falls, which may be before an optimum.
+that falls or rests, which may be before an optimum.
 """
 
 from __future__ import annotations
