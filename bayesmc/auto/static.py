@@ -9,6 +9,7 @@ from typing import Any
 from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.files import Opened
+from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import Laplace
@@ -18,6 +19,7 @@ from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
+from bayesmc.engines.options import engine_meant
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
@@ -30,6 +32,7 @@ from bayesmc.workers import check_executor
 _CHEAP = 256 * 2**20
 
 
+@by_keyword
 def infer(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Any = None,
@@ -285,7 +288,8 @@ def _checked(engine: Any) -> Any:
         )
     if not isinstance(engine, Engine):
         raise TypeError(
-            f"engine={engine!r} is not an engine; use Exact(), Gibbs(draws), LikelihoodWeighting(draws), ..."
+            f"engine={engine!r} is not an engine{engine_meant(engine)}; use Exact(), Gibbs(draws), "
+            "LikelihoodWeighting(draws), ..."
         )
     return engine
 

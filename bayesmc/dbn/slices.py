@@ -45,9 +45,9 @@ _CLOCK = {
 }
 
 #: names by which one may try to look further back: x_prev2, x_prev_prev, x_2prev, x_lag2
-_FAR_BACK = re.compile(r"(.+?)_?(?:prev(?:_?prev)+|prev_?\d+|\d+_?prev|prev_?\d+_prev|lag_?\d+)")
+_FAR_BACK = re.compile(r"(.+?)_?(?:prev((_?prev)+|_?\d+(_prev)?)|\d+_?prev|lag_?(?!1$)\d+)")
 #: other ways to write that of the slice before
-_TURNED = re.compile(r"(?:prev|previous|last)_(.+)")
+_TURNED = re.compile(r"(?:prev|previous|last)_(.+)|(.+?)_(?:t_?1|tm1|previous|last|lag_?1?)")
 #: names of nodes of the unrolled net
 _UNROLLED = re.compile(r"(.+)\[\d+\]")
 
@@ -94,10 +94,9 @@ class Template:
             return f"rows go under the name {slice_[1]!r}, time first: row k belongs to slice k"
         before = [n + PREVIOUS for n in self.later if n not in self.static]
         turned = _TURNED.fullmatch(name)
-        named = turned[1] + PREVIOUS if turned and turned[1] + PREVIOUS in before else name
-        return (
-            f"the template has no node {name!r}{did_you_mean(named, [*self.later, *before, TIME])}"
-        )
+        named = (turned[1] or turned[2]) + PREVIOUS if turned else name
+        hint = did_you_mean(named if named in before else name, [*self.later, *before, TIME])
+        return f"the template has no node {name!r}{hint}"
 
     def further_back(self, name: str) -> str | None:
         """How to look more than one slice back, if that is what a name is meant for."""

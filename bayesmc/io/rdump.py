@@ -4,8 +4,8 @@ Text only. In R, and so for JAGS and Stan, the first index of ``structure(c(...)
 fastest. WinBUGS and OpenBUGS write ``list(y = structure(.Data = c(...), .Dim = c(2, 3)))``, and there the
 last index does (OpenBUGS user manual, "Model Specification: Formatting of Data").
 
-Of what ``structure`` sets only the dimensions are numbers; names, levels and classes are passed over, so that a
-factor is its codes, which R counts from 1. Lists within, and data frames, are no arrays and refused.
+Of what ``structure`` sets only the dimensions are numbers; names, levels and classes are passed over, so that
+a factor is its codes, which R counts from 1. Lists within, and data frames, are no arrays and refused.
 """
 
 from __future__ import annotations
@@ -203,8 +203,8 @@ class _Reader:
     def _call(self, token: _Token) -> Any:
         if token.text == "list":
             raise FileFormatError(
-                "list(...) within the data is no array (a data frame is one, too): dump its columns as variables "
-                "of their own, in R with(d, dump(names(d), file))",
+                "list(...) within the data is no array (a data frame is one, too): dump its columns as "
+                "variables of their own, in R with(d, dump(names(d), file))",
                 self.path,
                 token.line,
             )

@@ -339,7 +339,8 @@ def _starts(unknowns: Unknowns, start: Mapping[str, Any], rng: np.random.Generat
     for name in start:
         if name not in unknowns.names:
             raise ModelError(
-                f"fit: start= names {name!r}, which is not learned: {list(unknowns.names)}"
+                f"fit: start= names {name!r}, which is not learned{did_you_mean(name, unknowns.names)}: "
+                f"{list(unknowns.names)}"
             )
     drawn = unknowns.starts(_STARTS, rng)
     if not start:

@@ -7,7 +7,7 @@ that they were made for.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -23,6 +23,7 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network.captured import captured, check_captured
+from bayesmc.network.clashing import refuse_misplaced
 from bayesmc.network.compile import compile_model
 from bayesmc.network.evidence import plate_sizes
 from bayesmc.network.model import Model
@@ -167,6 +168,7 @@ def settled_sizes(
             )
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
             raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
+    refuse_misplaced(declarations, evidence, inputs)
     sizes = plate_sizes(
         {**declared.sizes, **(given or {})}, declarations, evidence, inputs, labels=declared.labels
     )
@@ -402,14 +404,18 @@ def check_parents(
     for parent in parents:
         if parent not in declarations:
             raise UnknownNodeError(
-                f"{what} {name!r} has the parent {parent!r}: {unknown(declarations, parent)}. Declare it, "
+                f"{what} {name!r} has the parent {parent!r}: {unknown([n for n in declarations if n != name], parent)}. Declare it, "
                 "give the argument a default if it is no parent, or name the parents with parents="
             )
 
 
-def unknown(declarations: Mapping[str, Declaration], name: str) -> str:
+def unknown(declarations: Iterable[str], name: str) -> str:
     """That there is no such node, and which one may be meant."""
-    return f"the net has no node {name!r}{did_you_mean(name, declarations)}"
+    others = list(declarations)
+    known = (
+        f" (its nodes are {', '.join(others[:12])}{', ...' * (len(others) > 12)})" if others else ""
+    )
+    return f"the net has no node {name!r}{did_you_mean(name, declarations) or known}"
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
+from bayesmc.network.clashing import many_axes, surplus
 from bayesmc.network.labels import by_label, oriented, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, observed_links
@@ -206,9 +207,11 @@ def plate_sizes(
                 if sizes[plate] is None:
                     sizes[plate], source[plate] = size, name
                 elif sizes[plate] != size and plate in source:
+                    shapes = {n: _shape(v) for data_of in data for n, v in (data_of or {}).items()}
                     raise PlateError(
                         f"plate {plate!r} has size {sizes[plate]} in the data of {source[plate]!r} but "
                         f"{size} in that of {name!r}"
+                        + many_axes(shapes, declarations, (source[plate], name))
                     )
     known = [(n, v) for values in data for n, v in (values or {}).items() if n in declarations]
     refuse_crossed([(n, v, declarations[n].plates) for n, v in known], labels)
@@ -337,9 +340,10 @@ def _allowed(node: CompiledNode) -> str:
 
 def _shape_message(node: CompiledNode, shape: Shape) -> str:
     plates = ", ".join(f"{p}={n}" for p, n in zip(node.plates, node.plate_shape, strict=True))
+    fix = surplus(node.name, node.plates, node.value_shape, shape)
     return (
         f"evidence on {node.name!r} has shape {shape}, but the node's plates ({plates or 'none'}) and "
-        f"event shape {node.event_shape} make {node.value_shape}"
+        f"event shape {node.event_shape} make {node.value_shape}{fix}"
     )
 
 
@@ -393,6 +397,26 @@ def warn_of_doubts(model: Model, name: str, found: Observed | None) -> None:
     doubt = _doubt(model, name, values) or _degrees(model[name], values)
     if doubt is not None:
         warnings.warn(f"evidence on {name!r}: {doubt}", EvidenceWarning, stacklevel=2)
+
+
+def warn_of_nothing(model: Model, name: str, found: Observed | None) -> None:
+    """Look whether evidence has any values at all.
+
+    Warns
+    -----
+    EvidenceWarning
+        Of an empty array: a plate of size 0, read off the data.
+    """
+    if found is None or found.value.size:
+        return
+    node = model[name]
+    plates = ", ".join(f"{p}={n}" for p, n in zip(node.plates, node.plate_shape, strict=True))
+    warnings.warn(
+        f"evidence on {name!r} is empty (plates {plates}): nothing is learned from it; without other "
+        "evidence the answer is the prior",
+        EvidenceWarning,
+        stacklevel=2,
+    )
 
 
 # ---- private ------------------------------------------------------------------------------------
