@@ -8,6 +8,7 @@ from typing import Any
 
 from bayesmc.auto.choosing import explained_series
 from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
@@ -16,6 +17,7 @@ from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph
 
 
+@by_keyword
 def explain(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Mapping[str, Any] | None = None,

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.static import able, check_keep, checked_answer, choice
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
@@ -28,6 +29,7 @@ from bayesmc.workers.units import gathered, told_of_interrupt, workers_of
 _UNITS, _MOST = 8, 64
 
 
+@by_keyword
 def infer_many(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Any,

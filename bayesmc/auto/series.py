@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.auto.choosing import checked_engine, engine_for
 from bayesmc.auto.files import Opened
+from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
@@ -33,6 +34,7 @@ def filter(
 def filter(
     dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
 ) -> list[SeriesPosterior]: ...
+@by_keyword
 def filter(  # type: ignore[misc]
     dbn: DynamicBayesNet,
     observations: Any,
@@ -130,6 +132,7 @@ def smooth(
 def smooth(
     dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
 ) -> list[SeriesPosterior]: ...
+@by_keyword
 def smooth(  # type: ignore[misc]
     dbn: DynamicBayesNet,
     observations: Any,
@@ -193,6 +196,7 @@ def smooth(  # type: ignore[misc]
     return found
 
 
+@by_keyword
 def forecast(
     dbn: DynamicBayesNet | OnlineBelief,
     observations: Any = None,
@@ -240,6 +244,7 @@ def forecast(
     return found
 
 
+@by_keyword
 def most_likely(
     dbn: DynamicBayesNet,
     observations: Any,

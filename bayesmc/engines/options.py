@@ -108,11 +108,15 @@ def engine_meant(engine: Any) -> str:
     if not isinstance(engine, str):
         return ""
     word = "".join(c for c in engine.lower() if c.isalnum())
-    meant = next((name for name, words in _ENGINES.items() if word in words.split()), None)
+    meant = next((n for n, words in _ENGINES.items() if word in [_bare(n), *words.split()]), None)
     return "" if meant is None else f" (did you mean bmc.{meant}?)"
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _bare(name: str) -> str:
+    return name.split("(")[0].lower()
 
 
 def _meant(name: str, takes: list[str]) -> str:

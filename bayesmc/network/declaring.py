@@ -401,10 +401,11 @@ def check_parents(
     what: str = "node",
 ) -> None:
     """Refuse a parent that was never declared."""
+    others = [n for n in declarations if n != name]
     for parent in parents:
         if parent not in declarations:
             raise UnknownNodeError(
-                f"{what} {name!r} has the parent {parent!r}: {unknown([n for n in declarations if n != name], parent)}. Declare it, "
+                f"{what} {name!r} has the parent {parent!r}: {unknown(others, parent)}. Declare it, "
                 "give the argument a default if it is no parent, or name the parents with parents="
             )
 

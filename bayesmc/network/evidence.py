@@ -399,24 +399,21 @@ def warn_of_doubts(model: Model, name: str, found: Observed | None) -> None:
         warnings.warn(f"evidence on {name!r}: {doubt}", EvidenceWarning, stacklevel=2)
 
 
-def warn_of_nothing(model: Model, name: str, found: Observed | None) -> None:
-    """Look whether evidence has any values at all.
+def warn_of_nothing(observed: Mapping[str, Observed]) -> None:
+    """Look whether the evidence has any values at all.
 
     Warns
     -----
     EvidenceWarning
-        Of an empty array: a plate of size 0, read off the data.
+        All of it are empty arrays, so that plates have size 0.
     """
-    if found is None or found.value.size:
-        return
-    node = model[name]
-    plates = ", ".join(f"{p}={n}" for p, n in zip(node.plates, node.plate_shape, strict=True))
-    warnings.warn(
-        f"evidence on {name!r} is empty (plates {plates}): nothing is learned from it; without other "
-        "evidence the answer is the prior",
-        EvidenceWarning,
-        stacklevel=2,
-    )
+    if observed and not any(found.value.size for found in observed.values()):
+        warnings.warn(
+            f"evidence on {', '.join(map(repr, observed))} is empty (size 0): nothing is learned from it, "
+            "and the answer is the prior",
+            EvidenceWarning,
+            stacklevel=2,
+        )
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -55,5 +55,5 @@ def pose(
     question = read_question(net, evidence, inputs)
     for name, found in question[2].items():
         warn_of_doubts(question[1], name, found)
-        warn_of_nothing(question[1], name, found)
+    warn_of_nothing(question[2])
     return Problem(*question)
