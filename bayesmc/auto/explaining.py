@@ -8,9 +8,9 @@ from typing import Any
 
 from bayesmc.auto.choosing import explained_series
 from bayesmc.auto.explanation import Explanation
-from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions.parameters import by_keyword
 from bayesmc.engines.base import Engine
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.errors import UnsupportedError

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.static import able, check_keep, checked_answer, choice
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions.parameters import by_keyword
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.exact.many import Prepared, TablePosteriors

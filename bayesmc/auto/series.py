@@ -10,12 +10,12 @@ import numpy as np
 
 from bayesmc.auto.choosing import checked_engine, engine_for
 from bayesmc.auto.files import Opened
-from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.calendar import last_times
 from bayesmc.dbn.given import check_steps
+from bayesmc.distributions.parameters import by_keyword
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.particles.filter import ParticleFilter
@@ -34,8 +34,8 @@ def filter(
 def filter(
     dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
 ) -> list[SeriesPosterior]: ...
-@by_keyword
-def filter(  # type: ignore[misc]
+@by_keyword  # type: ignore[misc]
+def filter(
     dbn: DynamicBayesNet,
     observations: Any,
     *,
@@ -132,8 +132,8 @@ def smooth(
 def smooth(
     dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
 ) -> list[SeriesPosterior]: ...
-@by_keyword
-def smooth(  # type: ignore[misc]
+@by_keyword  # type: ignore[misc]
+def smooth(
     dbn: DynamicBayesNet,
     observations: Any,
     *,

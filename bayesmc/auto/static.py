@@ -9,10 +9,10 @@ from typing import Any
 from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.files import Opened
-from bayesmc.auto.keywords import by_keyword
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import Laplace
+from bayesmc.distributions.parameters import by_keyword
 from bayesmc.engines.approximate.laplace import LaplaceApproximation
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import KeysView
 from dataclasses import fields
 from typing import Any
 
+from bayesmc.distributions.parameters import Named
 from bayesmc.errors import did_you_mean
 
 #: what options of engines are called here -> what PyMC, Stan, JAGS, BUGS and their like call them
@@ -58,22 +58,8 @@ _ENGINES = {
 }  # fmt: skip
 
 
-class Options:
-    """What builds engines of options: an option that there is not is refused with the one that is meant."""
-
-    def __new__(cls, *_: Any, **options: Any) -> Any:
-        if options:
-            check_options(cls, options.keys())
-        return super().__new__(cls)
-
-
-def check_options(engine: type, given: KeysView[str]) -> None:
-    """Raise for an option that an engine does not have.
-
-    Raises
-    ------
-    TypeError
-        Says what it takes and which was meant.
+class Options(Named):
+    """What builds engines of options: an option that there is not is refused with the one that is meant.
 
     Examples
     --------
@@ -83,17 +69,25 @@ def check_options(engine: type, given: KeysView[str]) -> None:
         ...
     TypeError: Rejection has no option 'n_samples' (did you mean draws?); it takes draws, bound, max_proposals
     """
-    owner: Any = next(k for k in engine.__mro__ if "__init__" in k.__dict__)
-    made = owner.__dict__.get("__dataclass_params__")
-    if made is None or not made.init:  # an __init__ that somebody wrote knows what it takes
-        return
-    takes = [f.name for f in fields(owner) if f.init]
-    for name in given:
-        if name not in takes:
-            raise TypeError(
-                f"{engine.__name__} has no option {name!r}{_meant(name, takes)}; it takes "
-                f"{', '.join(takes) or 'none'}"
-            )
+
+    @classmethod
+    def refuse_option(cls, name: str) -> None:
+        """Raise for an option that the engine does not have.
+
+        Raises
+        ------
+        TypeError
+            Says what it takes and which was meant.
+        """
+        owner: Any = next(k for k in cls.__mro__ if "__init__" in k.__dict__)
+        made = owner.__dict__.get("__dataclass_params__")
+        if made is None or not made.init:  # an __init__ that somebody wrote knows what it takes
+            return
+        takes = [f.name for f in fields(owner) if f.init]
+        raise TypeError(
+            f"{cls.__name__} has no option {name!r}{_meant(name, takes)}; it takes "
+            f"{', '.join(takes) or 'none'}"
+        )
 
 
 def engine_meant(engine: Any) -> str:

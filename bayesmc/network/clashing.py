@@ -34,7 +34,7 @@ def data_around(declaration: Declaration, plates: Shape, sizes: Iterable[int]) -
     """
     clashing = {n for n in sizes if n > 1} - set(plates)
     for seen in declaration.captured:
-        shape = data_shape(seen.now)
+        shape = _data_shape(seen.now)
         size = next((n for n in shape if n in clashing), None)
         if size is None:
             continue
@@ -52,18 +52,35 @@ def data_around(declaration: Declaration, plates: Shape, sizes: Iterable[int]) -
     return None
 
 
-def sizes_in(message: str) -> set[int]:
-    """The sizes in what NumPy says of shapes that do not broadcast; none where it says something else.
+def sizes_in(message: str, batch: Shape) -> set[int]:
+    """The sizes in what NumPy says of shapes that do not broadcast, those of values in a batch apart.
 
     Examples
     --------
-    >>> sorted(sizes_in("operands could not be broadcast together with shapes (3,2) (5,)"))
-    [2, 3, 5]
+    >>> from bayesmc.network.clashing import sizes_in
+    >>> sizes_in("operands could not be broadcast together with shapes (3,2) (5,)", (3, 2))
+    {5}
     """
     if "broadcast" not in message and "mismatch" not in message:
         return set()
-    shapes = re.findall(r"\(((?:\d+,? ?)+)\)", message)
-    return {int(n) for shape in shapes for n in re.findall(r"\d+", shape)}
+    found = re.findall(r"\(((?:\d+,? ?)+)\)", message)
+    shapes = [tuple(int(n) for n in re.findall(r"\d+", shape)) for shape in found]
+    return {n for shape in shapes if shape[: len(batch)] != batch for n in shape}
+
+
+def sizes_beyond(shape: Shape, target: Shape) -> set[int]:
+    """The sizes by which a shape does not broadcast to another.
+
+    Examples
+    --------
+    >>> from bayesmc.network.clashing import sizes_beyond
+    >>> sizes_beyond((3, 2, 7), (3, 2)), sizes_beyond((3, 7), (3, 2)), sizes_beyond((5,), ())
+    ({7}, {7}, {5})
+    """
+    if target and shape[: len(target)] == target:
+        return {*shape[len(target) :]}
+    paired = zip(reversed(shape), reversed(target), strict=False)
+    return {a for a, b in paired if a not in (1, b)} | {*shape[: max(len(shape) - len(target), 0)]}
 
 
 def surplus(name: str, plates: tuple[str, ...], wanted: Shape, shape: Shape) -> str:
@@ -105,21 +122,16 @@ def many_axes(
     return ""
 
 
-def refuse_misplaced(
-    declarations: Mapping[str, Declaration],
-    evidence: Mapping[str, Any] | None,
-    inputs: Mapping[str, Any] | None,
-) -> None:
-    """Refuse inputs that stand in the evidence, where their values would be missed.
+def refuse_misplaced(net: Any, evidence: Mapping[str, Any], inputs: Any) -> None:
+    """Refuse inputs that stand in the evidence, where their values are missed.
 
     Raises
     ------
     EvidenceError
     """
     given = inputs if isinstance(inputs, Mapping) else {}
-    for name in evidence if isinstance(evidence, Mapping) else ():
-        known = declarations.get(name)
-        if known is not None and known.source == "input" and name not in given:
+    for name in evidence:
+        if name not in given and name in net and net[name].kind == "input":
             raise EvidenceError(
                 f"evidence on {name!r}, which is an input: its value is known, not observed; pass "
                 f"inputs={{{name!r}: value}} and leave it out of the evidence"
@@ -129,7 +141,7 @@ def refuse_misplaced(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def data_shape(value: Any) -> Shape:
+def _data_shape(value: Any) -> Shape:
     """Shape of an array, a column of a data frame or a list of numbers; () of anything else."""
     if not isinstance(value, (np.ndarray, list, tuple)) and not hasattr(value, "__array__"):
         return ()

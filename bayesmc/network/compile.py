@@ -22,7 +22,7 @@ from bayesmc.errors import (
     StateError,
 )
 from bayesmc.network.calling import Aligner, RowAligner
-from bayesmc.network.clashing import data_around, data_shape, sizes_in
+from bayesmc.network.clashing import data_around, sizes_in
 from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
@@ -59,8 +59,7 @@ def compile_model(
 ) -> Model:
     """Call every node once on reachable values of its parents and note what it is."""
     events = [n for d in declarations.values() for n in d.event_shape]
-    around = [n for d in declarations.values() for c in d.captured for n in data_shape(c.value)]
-    shape = tuple(unused_sizes([*sizes.values(), *events, *around], 2))[::-1]
+    shape = tuple(unused_sizes([*sizes.values(), *events], 2))[::-1]
     model = Model(name, {}, {}, dict(sizes), dict(labels), {}, shape)
     rng = np.random.default_rng(20)
     with marking_invalid(), np.errstate(all="ignore"):
@@ -163,11 +162,8 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
             node.called(entry(node, model.probe, model.probe_shape))
         except BayesmcError as alone:
             raise alone from alone.__cause__
-        around = data_around(
-            node.declaration,
-            node.plate_shape,
-            sizes_in(str(error.__cause__)) - {*model.probe_shape},
-        )
+        sizes = sizes_in(str(error.__cause__), model.probe_shape)
+        around = data_around(node.declaration, node.plate_shape, sizes)
         if around is not None:
             raise BroadcastError(f"node {node.name!r}: {around}") from error
         instead = "np.exp for math.exp" if "Python scalars" in str(error) else "np.where for if"

@@ -23,7 +23,6 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network.captured import captured, check_captured
-from bayesmc.network.clashing import refuse_misplaced
 from bayesmc.network.compile import compile_model
 from bayesmc.network.evidence import plate_sizes
 from bayesmc.network.model import Model
@@ -168,7 +167,6 @@ def settled_sizes(
             )
         if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
             raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
-    refuse_misplaced(declarations, evidence, inputs)
     sizes = plate_sizes(
         {**declared.sizes, **(given or {})}, declarations, evidence, inputs, labels=declared.labels
     )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
-from bayesmc.network.clashing import many_axes, surplus
+from bayesmc.network.clashing import many_axes, refuse_misplaced, surplus
 from bayesmc.network.labels import by_label, oriented, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, observed_links
@@ -114,7 +114,11 @@ def read_question(
 ) -> tuple[Any, Model, dict[str, Observed], dict[str, np.ndarray]]:
     """A snapshot of a net, its model for the data, and evidence and inputs as stored values."""
     given = evidence if isinstance(evidence, Mapping) else {}
-    model = net.model(given, inputs)
+    try:
+        model = net.model(given, inputs)
+    except EvidenceError:
+        refuse_misplaced(net, given, inputs)
+        raise
     links = observed_links(model.nodes, given)
     if links:
         net = net.with_links(links)
