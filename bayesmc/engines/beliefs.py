@@ -150,8 +150,8 @@ class SliceBelief(OnlineBelief):
         found = self._posterior
         if self.dbn is None:
             raise QueryError(
-                "this belief was unpickled, and pickles carry no functions: it says means, variances, "
-                "probabilities and densities of nodes; for the rest give it the template again, "
+                "this belief was loaded or unpickled, and files and pickles carry no functions: it says "
+                "means, variances, probabilities and densities of nodes; for the rest give it the template again, "
                 "engine.start(dbn, belief=belief)"
             )
         return found
@@ -202,8 +202,8 @@ def refuse_unbound(engine: Any, belief: Any) -> None:
     if belief.dbn is None:
         who = type(engine).__name__
         raise ModelError(
-            f"{who}().step: this belief was unpickled, and pickles carry no functions; give it the template "
-            "again, belief = engine.start(dbn, belief=belief), and go on"
+            f"{who}().step: this belief was loaded or unpickled, and files and pickles carry no "
+            "functions; give it the template again, belief = engine.start(dbn, belief=belief), and go on"
         )
 
 
