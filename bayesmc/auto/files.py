@@ -103,7 +103,7 @@ class Opened:
     Parameters
     ----------
     call : str
-        ``"infer"`` or ``"filter"``.
+        ``"infer"``, ``"infer_many"``, ``"filter"`` or ``"smooth"``.
     checkpoint : path or CheckpointFile
     problem : Problem or SeriesProblem
     named : bool
@@ -131,6 +131,11 @@ class Opened:
                 raise CheckpointError(
                     f"{call}(checkpoint={str(self.path)!r}): the file holds an answer that was saved, and "
                     "no run; give another path (bmc.load reads it)"
+                )
+            if "call" in self.header and self.header["call"] != call:
+                raise CheckpointError(
+                    f"{call}(checkpoint={str(self.path)!r}): the file belongs to a call of "
+                    f"{self.header['call']}; give another path"
                 )
 
     @property
@@ -167,6 +172,7 @@ class Opened:
             identity |= {what: told for what, told in was.items() if what.startswith(own)}
         header: Mapping[str, Any] = self.header or {
             "identity": identity, "engine": engine, "seed": seed, "keep": keep, "named": self.named,
+            "call": self.call,
         }  # fmt: skip
         if self.header is None:
             made(self.path, self.problem, header)

@@ -151,8 +151,8 @@ class SliceBelief(OnlineBelief):
         if self.dbn is None:
             raise QueryError(
                 "this belief was loaded or unpickled, and files and pickles carry no functions: it says "
-                "means, variances, probabilities and densities of nodes; for the rest give it the template again, "
-                "engine.start(dbn, belief=belief)"
+                "means, variances, probabilities and densities of nodes; for the rest give it the template "
+                "again, engine.start(dbn, belief=belief)"
             )
         return found
 

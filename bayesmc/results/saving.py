@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import BayesmcError, CheckpointError
+from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.states import StateArray
 from bayesmc.storage import Group, Lazy, Saver, Variable, packed, write_image
@@ -107,8 +107,6 @@ def _write(
         groups = groups_of(answer, elsewhere, lazily)
         write_image(path, groups, parts, {**attributes, **versions})
     except OSError as error:
-        if isinstance(error, (FileNotFoundError, IsADirectoryError, PermissionError)):
-            raise CheckpointError(f"{path}: {error}") from error
         raise refused(path, error) from error
 
 
