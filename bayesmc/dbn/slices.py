@@ -8,6 +8,7 @@ values for the second to be evaluated.
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,6 +20,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     BayesmcError,
+    CheckpointWarning,
     DensityError,
     ModelError,
     ParameterError,
@@ -28,6 +30,7 @@ from bayesmc.errors import (
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
 from bayesmc.network.declaring import DeclaredPlates, ModelStore
+from bayesmc.network.fingerprint import Fingerprint, fingerprint
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, topological_order
 from bayesmc.shapes import owned
@@ -239,7 +242,24 @@ class Slices:
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
         models = {"first": self.first.without_functions(), "later": self.later.without_functions()}
-        return {**self.__dict__, **models}
+        return {**self.__dict__, **models, "prints": self.prints}
+
+    @cached_property
+    def prints(self) -> Fingerprint:
+        """What both models say, in a form that outlives their functions; empty where these are gone."""
+        both = {"slice 0": self.first, "later slices": self.later}
+        found: Fingerprint = {}
+        for model in both.values():
+            declared = [node.declaration for node in model.nodes.values()]
+            if any(d.source == "function" and d.function is None for d in declared):
+                return found
+        with warnings.catch_warnings():
+            warnings.simplefilter(
+                "ignore", CheckpointWarning
+            )  # what cannot be seen is not compared
+            for where, model in both.items():
+                found |= {f"in {where} {what}": told for what, told in fingerprint(model).items()}
+        return found
 
     def model(self, t: int) -> Model:
         """The model of slice ``t``."""

@@ -240,6 +240,11 @@ def slices_like(dbn: DynamicBayesNet, belief: Any) -> Slices | None:
     new = dbn.slices(sizes, inputs)
     for a, b, where in ((old.first, new.first, "slice 0"), (old.later, new.later, "later slices")):
         _check_alike(a, b, where)
+    if new.first is not old.first or new.later is not old.later:
+        now = new.prints
+        for what, told in old.prints.items():
+            if now.get(what, told) != told:
+                raise _other(f"{what} is another one")
     return new
 
 
