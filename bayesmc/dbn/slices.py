@@ -8,7 +8,6 @@ values for the second to be evaluated.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayesmc.dbn.travelling import Travelling
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     BayesmcError,
-    CheckpointWarning,
     DensityError,
     ModelError,
     ParameterError,
@@ -30,7 +29,6 @@ from bayesmc.errors import (
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
 from bayesmc.network.declaring import DeclaredPlates, ModelStore
-from bayesmc.network.fingerprint import Fingerprint, fingerprint
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, topological_order
 from bayesmc.shapes import owned
@@ -224,7 +222,7 @@ class Template:
 
 
 @dataclass(frozen=True, eq=False)
-class Slices:
+class Slices(Travelling):
     """A compiled template.
 
     Attributes
@@ -238,28 +236,6 @@ class Slices:
     template: Template
     first: Model
     later: Model
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions."""
-        models = {"first": self.first.without_functions(), "later": self.later.without_functions()}
-        return {**self.__dict__, **models, "prints": self.prints}
-
-    @cached_property
-    def prints(self) -> Fingerprint:
-        """What both models say, in a form that outlives their functions; empty where these are gone."""
-        both = {"slice 0": self.first, "later slices": self.later}
-        found: Fingerprint = {}
-        for model in both.values():
-            declared = [node.declaration for node in model.nodes.values()]
-            if any(d.source == "function" and d.function is None for d in declared):
-                return found
-        with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", CheckpointWarning
-            )  # what cannot be seen is not compared
-            for where, model in both.items():
-                found |= {f"in {where} {what}": told for what, told in fingerprint(model).items()}
-        return found
 
     def model(self, t: int) -> Model:
         """The model of slice ``t``."""

@@ -74,12 +74,12 @@ def fit(
         Dirichlet counts that are added to every entry of a table (of those named), on top of what was seen: 0
         is maximum likelihood, 1 one more case of every kind.
     start : dict, optional
-        Where to begin: node -> value, table -> probabilities. Of nodes that are not named several draws of
-        their prior are tried; tables begin as the net has them.
+        Where to begin: node -> value, table -> probabilities, such as ``values`` of an earlier fit. Of nodes
+        that are not named several draws of their prior are tried; tables begin as the net has them.
     engine : optional
         Of a template: whose log evidence is maximised. It must be deterministic; None takes an exact one.
     tolerance : float
-        Of the slope, or of EM's rise per case, at which it ends.
+        Of the slope at which it ends; of EM, of the rise by one plain step, in nats.
     max_iterations : int
     rng : seed, SeedSequence, Generator or None
         For starts.
@@ -126,6 +126,13 @@ def fit(
     """
     if not isinstance(net, (BayesNet, DynamicBayesNet)):
         raise ModelError(f"fit: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}")
+    if not isinstance(start, Mapping | None):
+        raise ModelError(
+            f"fit: start= is a {type(start).__name__}; give a dict, node -> value or table -> probabilities"
+        )
+    if max_iterations < 1:
+        raise ModelError(f"fit: max_iterations is {max_iterations}; give 1 or more")
+    start = start or {}
     data, inputs = _as_dicts(net, data, inputs)
     chosen = _chosen(net, data, inputs, learn)
     tables = [n for n in chosen if _is_table(net, n)]
@@ -139,9 +146,9 @@ def fit(
                 "one after the "
                 "other (learn=)"
             )
-        return fit_tables(net, data, inputs, tables, counts, start or {}, tolerance, max_iterations)
+        return fit_tables(net, data, inputs, tables, counts, start, tolerance, max_iterations)
     objective, unknowns = _objective(net, data, inputs, chosen, prior, engine)
-    starts = _starts(unknowns, start or {}, np.random.default_rng(seed_sequence(rng)))
+    starts = _starts(unknowns, start, np.random.default_rng(seed_sequence(rng)))
     found = maximum(objective, starts, tolerance, max_iterations)
     return _fitted(net, objective, unknowns, found, prior)
 

@@ -200,14 +200,18 @@ def _plain(value: Any) -> Any:
 def _begin(name: str, table: np.ndarray, start: Mapping[str, Any]) -> np.ndarray:
     if name not in start:
         return table
-    given = np.asarray(start[name], dtype=float)
-    if given.shape != table.shape or not np.allclose(given.sum(axis=-1), 1.0) or (given < 0).any():
+    wanted = f"give probabilities of shape {table.shape}, whose rows sum to 1"
+    try:
+        given = np.asarray(start[name], dtype=float)
+    except (TypeError, ValueError):
         raise ModelError(
-            f"fit: start of {name!r} has shape {given.shape}; give probabilities of shape "
-            f"{table.shape}, whose rows sum "
-            "to 1"
-        )
-    return given
+            f"fit: start of {name!r} is no array of numbers, but {start[name]!r}; {wanted}"
+        ) from None
+    if given.shape != table.shape:
+        raise ModelError(f"fit: start of {name!r} has shape {given.shape}; {wanted}")
+    if not np.allclose(given.sum(axis=-1), 1.0) or (given < 0).any():
+        raise ModelError(f"fit: start of {name!r} is no table of probabilities; {wanted}")
+    return given / given.sum(axis=-1, keepdims=True)
 
 
 def _check_names(start: Mapping[str, Any], begin: Tables) -> None:
