@@ -354,9 +354,10 @@ def _smoothed(
         own = seed_sequence(None) if seed is None else seed
         return _smoothed_now(problem, engine, own, options)
     opened = Opened("smooth", checkpoint, problem, engine is not None)
-    engine = opened.engine if engine is None else engine
+    if engine is None and opened.header is not None and opened.header.get("named"):
+        engine = opened.engine
     seed = opened.seed(None) if seed is None else seed
-    chosen = _smoother(problem, engine, options)[0]
+    chosen = _smoother(problem, engine or opened.engine, options)[0]
     asked = {n: options[n] for n in ("lag", "queries", "trajectories", "backward")}
     file, answer = opened.begin(chosen, seed, None, asked)
     if file is None:
