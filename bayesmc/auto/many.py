@@ -129,7 +129,7 @@ def infer_many(
         return Posteriors([])
     with _in_set(0):
         first = pose_any(net, sets[0], given[0])
-        check_keep("infer_many", keep, first)
+        check_keep("infer_many", keep, first, checkpoint)
         exact = engine
         if engine is None:
             exact = choice(first)
