@@ -33,7 +33,6 @@ from bayesmc.engines.grid.posterior import (
 from bayesmc.engines.grid.search import (
     GridOptions,
     GridSearch,
-    known_static,
     too_large,
     unread,
     without_density,
@@ -127,7 +126,7 @@ class GridFilter(GridOptions, FilterEngine):
                 return reason
         try:
             with quiet():
-                model = self.model_on_grid(problem.slices, known_static(problem))
+                model = self.model_on_grid(problem.slices, problem.known_static)
         except BayesmcError as error:
             return str(error)
         name = self._search.automatic(problem)
@@ -139,11 +138,15 @@ class GridFilter(GridOptions, FilterEngine):
         return too_large(model, problem, self.max_bytes) or without_density(problem)
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
-        """Hidden nodes that are integrated out and have no closed moments."""
+        """Hidden nodes that are integrated out and have no closed moments, and what is computed from any."""
         found = []
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.model_on_grid(problem.slices, problem.known_static)
         for name in problem.hidden:
             node = problem.model[name]
+            if name not in model.own:
+                now = model.sources(True, name).now | model.sources(False, name).now
+                found += [name] if now & model.leaves & {*problem.hidden} else []
+                continue
             if name not in model.leaves or node.domain is not None:
                 continue
             with quiet():
@@ -166,7 +169,7 @@ class GridFilter(GridOptions, FilterEngine):
         reason = super().unable(problem, asked)
         if reason is not None:
             return reason
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.model_on_grid(problem.slices, problem.known_static)
         return unread(model, asked.queries, problem.hidden)
 
     def is_displaced(self, problem: SeriesProblem) -> bool:
@@ -177,7 +180,7 @@ class GridFilter(GridOptions, FilterEngine):
 
     def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
         grid = self._search.found(problem)
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.model_on_grid(problem.slices, problem.known_static)
         model = model if grid is None else grid.mover.model
 
         def treated(name: str) -> str:
@@ -280,7 +283,7 @@ class GridFilter(GridOptions, FilterEngine):
 
         Hidden nodes that nothing reads and that have no grid are integrated out and left out.
         """
-        static = known_static(problem)
+        static = problem.known_static
         with quiet(), Progress(problem.steps, self.label, progress) as bar:
             found_grid = self._search.found(problem)
             axis = None if found_grid is None else (found_grid.name, found_grid.axis)
@@ -329,7 +332,7 @@ class GridFilter(GridOptions, FilterEngine):
         if found is not None:
             return found.mover, found.kept
         with quiet():
-            model = self.model_on_grid(problem.slices, known_static(problem))
+            model = self.model_on_grid(problem.slices, problem.known_static)
             return GridMover(model, self.tolerance), None
 
     def _judged(
@@ -377,5 +380,5 @@ class GridFilter(GridOptions, FilterEngine):
 
 def _looks(problem: SeriesProblem, mover: GridMover) -> Replicates:
     """What holds rows against those that the grid expects; the same draws always, as of all it answers."""
-    plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
+    plan = SlicePlan(problem.slices, mover.model.apart, problem.known_static)
     return Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK))

@@ -67,11 +67,6 @@ class GridOptions:
         return GridModel(slices, axes, static, self.max_bytes, logs)
 
 
-def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:
-    """Values of the static nodes."""
-    return {n: o.value for n, o in problem.series.static.items()}
-
-
 def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str | None:
     """Why the tables do not fit, found from their sizes alone."""
     hidden = frozenset(n for n in problem.hidden if n in model.own and n not in model.leaves)
@@ -180,7 +175,7 @@ class GridSearch:
         """The one hidden number of a slice, whose grid is found; None where there is none."""
         if self.options.quadrature != "midpoint":
             return None
-        model = self.options.model_on_grid(problem.slices, known_static(problem))
+        model = self.options.model_on_grid(problem.slices, problem.known_static)
         numbers = _numbers(problem, model)
         if len(numbers) != 1 or numbers[0] in self.options.grid:
             return None
@@ -207,7 +202,7 @@ class GridSearch:
         line = None if name is None else line_of(problem.slices, name)
         if name is None or line is None:
             return None
-        static = known_static(problem)
+        static = problem.known_static
         rows = [problem.series.row(k) for k in range(problem.steps)]
 
         def make(axis: Axis) -> GridModel:
@@ -240,7 +235,7 @@ class GridSearch:
                     GridWarning,
                     stacklevel=5,
                 )
-        elif _numbers(problem, self.options.model_on_grid(problem.slices, known_static(problem))):
+        elif _numbers(problem, self.options.model_on_grid(problem.slices, problem.known_static)):
             nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
             posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
         return posterior
