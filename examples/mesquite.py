@@ -156,8 +156,8 @@ def fitted(draws: int, names: Sequence[str] = (*LOGS, "weights")) -> dict[str, A
 def exact_elpd(name: str) -> np.ndarray:
     """Log densities of every bush given all others, without draws: Student t densities, shape (bushes,).
 
-    With flat priors on coefficients and sigma, n - 1 bushes and k columns, n - k - 2 degrees of freedom; one more
-    where log sigma has the flat prior (Gelman et al. 2013, Bayesian Data Analysis, sec. 14.2).
+    With flat priors on coefficients and sigma, n - 1 bushes and k columns, n - k - 2 degrees of freedom; one
+    more where log sigma has the flat prior (Gelman et al. 2013, Bayesian Data Analysis, sec. 14.2).
     """
     x, y = columns()[name], observed(name)
     found = np.empty(len(y))

@@ -91,6 +91,20 @@ class Fit:
         }
         return Summary(tuple(names), columns, self._title())
 
+    def to_dataframe(self) -> Any:
+        """``summary()`` as a pandas ``DataFrame``, a row for each number.
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas (the extra ``pandas``).
+        """
+        return self.summary().to_dataframe()
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it."""
+        return self.summary()._repr_html_()
+
     def _title(self) -> str:
         how = "converged" if self.converged else "NOT converged"
         told = f"log likelihood {self.log_likelihood:.4f}, {how} after {self.iterations} iterations"

@@ -73,6 +73,19 @@ def test_a_local_level_is_the_maximum_of_the_dense_gaussian() -> None:
     np.testing.assert_allclose(smoothed.mean("x"), wanted.mean("x"))
 
 
+def test_a_fit_is_a_table_for_notebooks_and_pandas() -> None:
+    pandas = pytest.importorskip("pandas")
+    net = bmc.BayesNet(plates={"i": 4, "k": ["a", "b"]})
+    net.add("m", bmc.Normal(0.0, 10.0), plates="k")
+    net.add("y", lambda m: bmc.Normal(m, 1.0), plates=("k", "i"))
+    found = bmc.fit(net, {"y": np.arange(8.0).reshape(2, 4)}, learn="m")
+    frame = found.to_dataframe()
+    pandas.testing.assert_frame_equal(frame, found.summary().to_dataframe())
+    assert list(frame.index) == ["m[a]", "m[b]"]
+    np.testing.assert_allclose(frame["estimate"], [1.5, 5.5], atol=1e-4)
+    assert "m[a]" in found._repr_html_() and "maximum likelihood" in found._repr_html_()
+
+
 def test_labels_are_summed_out() -> None:
     rng = np.random.default_rng(0)
     z = rng.random(100) < 0.4
