@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
+from bayesmc.dbn import UNCOMPARED, DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import (
     Asked,
@@ -20,6 +20,7 @@ from bayesmc.engines.filtering import (
     pass_slices,
     quiet,
 )
+from bayesmc.engines.grid.automatic import FoundGrid
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.posterior import (
     GridBelief,
@@ -157,6 +158,14 @@ class GridFilter(GridOptions, FilterEngine):
                     found.append(name)
         return tuple(found)
 
+    def grid_for(self, problem: SeriesProblem) -> FoundGrid | None:
+        """The grid that it finds for a problem, which serves like problems, too; None where none is found."""
+        return self._search.found(problem)
+
+    def taking(self, problem: SeriesProblem, found: FoundGrid | None) -> None:
+        """Let a problem be filtered on a grid found for another, so that like evidences differ smoothly."""
+        self._search.take(problem, found)
+
     @property
     def _search(self) -> GridSearch:
         """The search for a grid of one hidden number, by these options."""
@@ -215,15 +224,20 @@ class GridFilter(GridOptions, FilterEngine):
                 "None, which keeps densities, too"
             )
         mover, kept = self._start(problem)
-        record = GridRecord(mover.model, problem.hidden, problem.steps, queries or {}, keep is None)
-        looks = _looks(problem, mover)
+        alone = bool(problem.cache.get(UNCOMPARED))  # the evidence is all that is asked
+        names = () if alone else problem.hidden
+        record = GridRecord(
+            mover.model, names, problem.steps, queries or {}, keep is None and not alone
+        )
+        looks = None if alone else _looks(problem, mover)
         increments = np.empty((problem.steps, *mover.model.lead))
         before: Cells | None = None
 
         def move(k: int) -> None:
             nonlocal before
             row = problem.series.row(k)
-            looks.look(k, draws_of(mover.model, before), row)
+            if looks is not None:
+                looks.look(k, draws_of(mover.model, before), row)
             cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
             record.add(k, answers_of(mover, before, cells, cells.probs))
@@ -336,9 +350,11 @@ class GridFilter(GridOptions, FilterEngine):
             return GridMover(model, self.tolerance), None
 
     def _judged(
-        self, problem: SeriesProblem, found: GridPosterior, looks: Replicates
+        self, problem: SeriesProblem, found: GridPosterior, looks: Replicates | None
     ) -> GridPosterior:
         """With the error of the log evidence, and how rows compare with what was expected."""
+        if looks is None:
+            return found
         found = self._search.with_error(problem, found)
         found.predictive = looks.found(found.steps)
         warn_of_misfit(found.predictive, "GridFilter", found.start, 4)

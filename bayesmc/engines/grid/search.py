@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import quiet
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, line_of, read_axes
+from bayesmc.engines.grid.moves import GridMover
 from bayesmc.engines.grid.posterior import GridPosterior
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
@@ -191,11 +192,25 @@ class GridSearch:
 
     def found(self, problem: SeriesProblem) -> FoundGrid | None:
         """The grid of the one hidden number, found once for a problem; None where there is none to find."""
-        key = f"grid {self.options!r}"
-        if key not in problem.cache:
+        if self._key not in problem.cache:
             with quiet():
-                problem.cache[key] = self._sought(problem)
-        return problem.cache[key]
+                problem.cache[self._key] = self._sought(problem)
+        return problem.cache[self._key]
+
+    def take(self, problem: SeriesProblem, found: FoundGrid | None) -> None:
+        """Answer a problem on the grid found for another with the same nodes, whatever that loses."""
+        if found is not None:
+            axis = found.name, found.axis
+            with quiet():
+                model = self.options.model_on_grid(problem.slices, problem.known_static, axis=axis)
+            unknown = np.full_like(found.error, np.nan)
+            mover = GridMover(model, np.inf)
+            found = replace(found, error=unknown, mover=mover, kept=None)
+        problem.cache[self._key] = found
+
+    @property
+    def _key(self) -> str:
+        return f"grid {self.options!r}"
 
     def _sought(self, problem: SeriesProblem) -> FoundGrid | None:
         name = self.automatic(problem)
