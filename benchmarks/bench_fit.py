@@ -1,28 +1,24 @@
 """Learning beside statsmodels, hmmlearn and pyAgrum: optima, standard errors, EM of tables with missing data.
 
-``python -m benchmarks.bench_fit [CASES]``: CASES (1,000) are those of ALARM that the peer learns from; ours
-learns from 10,000 as well. The peers' environment is that of ``make peers``.
+``python -m benchmarks.bench_fit [CASES [whole]]``: ALARM's tables are learned from up to CASES cases (1,000;
+with 10,000 some 10 minutes), and with ``whole`` the peer goes on until it ends (another hour). The
+peers' environment is that of ``make peers``.
 """
 
 from __future__ import annotations
 
-import gzip
 import json
-import subprocess
 import sys
-import tempfile
 import time
 import warnings
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import bayesmc as bmc
-from benchmarks.harness import HERE, data_folder, network, peer_python, table
-
-MISSING, CASES = 0.2, 10_000
+from benchmarks import alarm_tables
+from benchmarks.harness import data_folder, peer_answer, table
 
 
 def local_level(initial: tuple[float, float], spread: float) -> bmc.DynamicBayesNet:
@@ -87,10 +83,10 @@ def counts(y: np.ndarray) -> bmc.DynamicBayesNet:
     return dbn
 
 
-def main(cases: int = 1_000) -> None:
+def main(cases: int = 1_000, whole: bool = False) -> None:
     """Print optima and errors beside the peers' (Kalman, hidden Markov), then ALARM's tables."""
-    print(table("maximum likelihood of series", *_series()) + "\n")
-    print(_alarm(cases) + "\n")
+    print(table("maximum likelihood of series", *_series()) + "\n", flush=True)
+    alarm_tables.main(cases, whole)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -103,7 +99,7 @@ def _series() -> tuple[list[str], list[list[object]]]:
         found, seconds = _timed(
             lambda m=made, y=y, i=initial: bmc.fit(m(i, float(np.nanvar(y))), {"y": y})
         )
-        peer = _peer({"job": "kalman", "kind": kind, "y": y.tolist(), "initial": initial})
+        peer = _ask({"job": "kalman", "kind": kind, "y": y.tolist(), "initial": initial})
         rows.append(
             _row(
                 name, "statsmodels", found, seconds, peer, lambda n, f=found: float(f.std_errors[n])
@@ -111,7 +107,7 @@ def _series() -> tuple[list[str], list[list[object]]]:
         )
     growth, yearly = _columns("us_rgnp_hamilton.csv", 1), _yearly()
     found, seconds = _timed(lambda: bmc.fit(regimes(growth, True), {"y": growth}))
-    peer = _peer({"job": "switching", "y": growth.tolist()})
+    peer = _ask({"job": "switching", "y": growth.tolist()})
     rows.append(
         _row("GNP growth, 2 regimes", "statsmodels", found, seconds, peer, _regime_errors(found))
     )
@@ -120,7 +116,7 @@ def _series() -> tuple[list[str], list[list[object]]]:
         ("coal, 2 rates", "poisson", yearly, counts(yearly)),
     ):
         found, seconds = _timed(lambda d=dbn, y=y: bmc.fit(d, {"y": y}))
-        peer = _peer({"job": "hidden Markov", "kind": kind, "y": y.tolist()})
+        peer = _ask({"job": "hidden Markov", "kind": kind, "y": y.tolist()})
         rows.append(_row(name, "hmmlearn", found, seconds, peer, None))
     header = ["series", "peer", "log likelihood", "less peer's", "worst s.e. ratio", "s", "peer, s"]
     return header, rows
@@ -166,69 +162,6 @@ def _regime_errors(found: Any) -> Callable[[str], float]:
     return error
 
 
-def _alarm(cases: int) -> str:
-    net = bmc.io.read(network("alarm"))
-    columns = _with_gaps(net, CASES)
-    rows: list[list[object]] = []
-    for count in dict.fromkeys((cases, CASES)):
-        own = {n: c[:count] for n, c in columns.items()}
-        found, seconds = _timed(lambda own=own: bmc.fit(net, own))
-        never = bool((np.diff(found.history) >= 0).all())
-        line: list[object] = [
-            count,
-            f"{found.log_likelihood:.4f}",
-            len(found.history) - 1,
-            str(never),
-            seconds,
-        ]
-        with tempfile.TemporaryDirectory() as folder:
-            result = _their_tables(own, Path(folder)) if count == cases else None
-        if result is not None:
-            theirs, peer = result
-            # the likelihood of the peer's tables
-            again, _ = _timed(lambda own=own, net=theirs: bmc.fit(net, own, max_iterations=1))
-            stopped = again.history[0]
-            line += [f"{stopped:.4f}", peer["seconds"], peer["seconds"] / seconds]
-        rows.append(line)
-    header = [
-        "cases",
-        "log likelihood",
-        "iterations",
-        "never fell",
-        "s",
-        "pyAgrum's",
-        "pyAgrum, s",
-        "ratio",
-    ]
-    return table(
-        f"ALARM's tables, {MISSING:.0%} missing (pgmpy's EM drops such cases)", header, rows
-    )
-
-
-def _with_gaps(net: Any, cases: int) -> dict[str, list[str | None]]:
-    drawn, rng = net.sample(cases, rng=1), np.random.default_rng(2)
-    columns = {}
-    for name in net:
-        values = np.asarray(drawn[name].labels, dtype=object)
-        values[rng.random(cases) < MISSING] = None
-        columns[name] = values.tolist()
-    return columns
-
-
-def _their_tables(cases: Mapping[str, Any], folder: Path) -> tuple[Any, dict[str, Any]] | None:
-    plain, result = folder / "alarm.bif", folder / "learned.bif"
-    plain.write_bytes(gzip.decompress(network("alarm").read_bytes()))
-    question = {
-        "job": "tables",
-        "cases": cases,
-        "network": str(plain),
-        "result": str(result),
-        "rate": 1e-6,
-    }
-    answer = _peer(question)
-    return None if answer is None else (bmc.io.read(result), answer)
-
-
 def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
     start = time.perf_counter()
     with warnings.catch_warnings():
@@ -237,17 +170,8 @@ def _timed(call: Callable[[], Any]) -> tuple[Any, float]:
     return found, time.perf_counter() - start
 
 
-def _peer(question: Mapping[str, Any]) -> dict[str, Any] | None:
-    python = peer_python()
-    if python is None:
-        return None
-    command = [str(python), str(HERE / "peers" / "fit_run.py")]
-    done = subprocess.run(command, input=json.dumps(question), capture_output=True, text=True)
-    if done.returncode:
-        print(f"the peer's {question['job']} failed: {done.stderr.strip().splitlines()[-1]}")
-        return None
-    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
-    return found
+def _ask(question: Mapping[str, Any]) -> dict[str, Any] | None:
+    return peer_answer("fit_run.py", question)
 
 
 def _linear() -> list[tuple[str, str, np.ndarray, tuple[float, float]]]:
@@ -274,4 +198,4 @@ def _yearly() -> np.ndarray:
 
 
 if __name__ == "__main__":
-    main(*map(int, sys.argv[1:2]))
+    main(*map(int, sys.argv[1:2]), whole="whole" in sys.argv[2:])

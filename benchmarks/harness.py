@@ -186,6 +186,10 @@ class Peer(Worker):
         """Seconds for one run with this evidence."""
         return float(self.ask(evidence=dict(evidence), answer=False)["seconds"])
 
+    def cpu_seconds(self, evidence: Mapping[str, str]) -> float:
+        """The same in seconds of its process, which other processes do not stretch."""
+        return float(self.ask(evidence=dict(evidence), answer=False)["cpu_seconds"])
+
     def marginals(self, evidence: Mapping[str, str]) -> dict[str, dict[str, float]]:
         """The peer's answer: node to state label to probability."""
         return self.ask(evidence=dict(evidence), answer=True)["marginals"]
@@ -193,6 +197,20 @@ class Peer(Worker):
     def timed(self, *evidence: Mapping[str, str]) -> SelfTimed:
         """An entry for :func:`interleave` that asks each evidence in turn and times all of them."""
         return SelfTimed(lambda: sum(self.seconds(one) for one in evidence))
+
+
+def peer_answer(script: str, question: Mapping[str, Any]) -> dict[str, Any] | None:
+    """What a script of ``peers/`` answers, JSON for JSON; None without the peers, or if it fails."""
+    python = peer_python()
+    if python is None:
+        return None
+    command = [str(python), str(HERE / "peers" / script)]
+    done = subprocess.run(command, input=json.dumps(question), capture_output=True, text=True)
+    if done.returncode:
+        print(f"the peer's {question['job']} failed: {done.stderr.strip().splitlines()[-1]}")
+        return None
+    found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    return found
 
 
 def peer_python() -> Path | None:

@@ -75,12 +75,12 @@ def fit(
         Dirichlet counts that are added to every entry of a table (of those named), on top of what was seen: 0
         is maximum likelihood, 1 one more case of every kind.
     start : dict, optional
-        Where to begin: node -> value, table -> probabilities. Of nodes that are not named several draws of
-        their prior are tried; tables begin as the net has them.
+        Where to begin: node -> value, table -> probabilities, such as ``values`` of an earlier fit. Of nodes
+        that are not named several draws of their prior are tried; tables begin as the net has them.
     engine : optional
         Of a template: whose log evidence is maximised. It must be deterministic; None takes an exact one.
     tolerance : float
-        Of the slope, or of EM's rise per case, at which it ends.
+        Of the slope at which it ends; of EM, of the rise by one plain step, in nats.
     max_iterations : int
     restarts : int, optional
         How many climbs are made, or how often EM begins; the highest end is taken, and ``climbs`` has them
@@ -132,7 +132,8 @@ def fit(
     """
     if not isinstance(net, (BayesNet, DynamicBayesNet)):
         raise ModelError(f"fit: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}")
-    _check_restarts(restarts)
+    _check_options(start, max_iterations, restarts)
+    start = start or {}
     data, inputs = _as_dicts(net, data, inputs)
     chosen = _chosen(net, data, inputs, learn)
     tables = [n for n in chosen if _is_table(net, n)]
@@ -148,10 +149,10 @@ def fit(
             )
         again = restarts or 1, np.random.default_rng(seed_sequence(rng))
         return fit_tables(
-            net, data, inputs, tables, counts, start or {}, tolerance, max_iterations, *again
+            net, data, inputs, tables, counts, start, tolerance, max_iterations, *again
         )
     objective, unknowns = _objective(net, data, inputs, chosen, prior, engine)
-    starts = _starts(unknowns, start or {}, np.random.default_rng(seed_sequence(rng)), restarts)
+    starts = _starts(unknowns, start, np.random.default_rng(seed_sequence(rng)), restarts)
     found = maximum(objective, starts, tolerance, max_iterations, restarts)
     return _fitted(net, objective, unknowns, found, prior)
 
@@ -303,10 +304,16 @@ def _by_elimination(
     return Evidence(unknowns, log_evidence, prior)
 
 
-def _check_restarts(restarts: Any) -> None:
+def _check_options(start: Any, max_iterations: int, restarts: Any) -> None:
+    if not isinstance(start, Mapping | None):
+        raise ModelError(
+            f"fit: start= is a {type(start).__name__}; give a dict, node -> value or table -> probabilities"
+        )
+    if max_iterations < 1:
+        raise ModelError(f"fit: max_iterations is {max_iterations}; give 1 or more")
     whole = isinstance(restarts, (int, np.integer)) and not isinstance(restarts, bool)
     if restarts is not None and not (whole and restarts > 0):
-        raise ValueError(f"fit(restarts={restarts!r}): give a whole number of climbs, 1 or more")
+        raise ModelError(f"fit: restarts is {restarts!r}; give a whole number of climbs, 1 or more")
 
 
 def _starts(

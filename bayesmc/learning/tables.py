@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -34,17 +34,15 @@ def fit_tables(
     start: Mapping[str, Any],
     tolerance: float,
     most: int,
-    restarts: int,
-    rng: np.random.Generator,
+    *again: Any,
 ) -> Fit:
-    """See ``fit``."""
+    """See ``fit``; ``again`` is how often EM begins, and a generator."""
     if isinstance(net, DynamicBayesNet):
         series = SeriesCounts(net, data, inputs, learned)
         begin = {n: _begin(n, t, start) for n, t in series.tables().items()}
         _check_names(start, begin)
-        found, ends = _highest(
-            series.expected, begin, counts, tolerance, most, _begins(begin, start, restarts, rng)
-        )
+        begins = _begins(begin, start, *again)
+        found, ends = _highest(series.expected, begins, counts, tolerance, most)
         return _fit(series.filled(found.tables), found, counts, ends)
     if inputs:
         raise UnsupportedError("fit: tables are learned of nets without inputs; leave inputs= out")
@@ -55,13 +53,7 @@ def fit_tables(
         raise EvidenceError(
             "fit: there are no data; give a column for each node, with one entry for each case"
         )
-    for name in data:
-        if name not in model.nodes:
-            raise EvidenceError(
-                f"fit: the data have a column {name!r}, which is no "
-                f"node{did_you_mean(name, model.nodes)}; drop it, or "
-                "rename it"
-            )
+    _check_columns(data, model)
     columns = {n: _codes(model[n], data[n]) for n in names if n in data}
     lengths = {n: len(c) for n, c in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -83,9 +75,8 @@ def fit_tables(
     def expected(at: Mapping[str, np.ndarray]) -> tuple[float, Mapping[str, np.ndarray]]:
         return cases.expected({**known, **at})
 
-    found, ends = _highest(
-        expected, begin, counts, tolerance, most, _begins(begin, start, restarts, rng)
-    )
+    begins = _begins(begin, start, *again)
+    found, ends = _highest(expected, begins, counts, tolerance, most)
     declarations = {
         n: replace(d, probs=found.tables[n]) if n in found.tables else d
         for n, d in net.declarations.items()
@@ -99,27 +90,23 @@ def fit_tables(
 
 def _begins(
     begin: Tables, start: Mapping[str, Any], restarts: int, rng: np.random.Generator
-) -> Iterator[Tables]:
+) -> list[Tables]:
     """Tables to begin at: those of the net, then random rows of all that are not given."""
-    yield begin
+    found = [begin]
     for _ in range(restarts - 1):
         drawn = {}
         for name, table in begin.items():
             rows = rng.standard_gamma(1.0, size=table.shape) * (table > 0)
             drawn[name] = table if name in start else rows / rows.sum(axis=-1, keepdims=True)
-        yield drawn
+        found.append(drawn)
+    return found
 
 
 def _highest(
-    expected: Any,
-    begin: Tables,
-    counts: Any,
-    tolerance: float,
-    most: int,
-    begins: Iterable[Tables],
+    expected: Any, begins: Sequence[Tables], counts: Any, tolerance: float, most: int
 ) -> tuple[Learned, np.ndarray]:
     """The highest end of EM, and all, highest first."""
-    added = _dirichlet(begin, counts)
+    added = _dirichlet(begins[0], counts)
     found = [maximised(expected, at, added, tolerance, most) for at in begins]
     best = max(found, key=lambda each: each.objective)
     return best, np.sort([each.objective for each in found])[::-1]
@@ -145,6 +132,16 @@ def _fit(filled: Any, found: Learned, counts: Any, ends: np.ndarray) -> Fit:
         filled, found.tables, found.errors, found.log_likelihood, found.objective, found.history,
         found.converged, len(found.history) - 1, how, climbs=ends,
     )  # fmt: skip
+
+
+def _check_columns(data: Mapping[str, Any], model: Model) -> None:
+    for name in data:
+        if name not in model.nodes:
+            raise EvidenceError(
+                f"fit: the data have a column {name!r}, which is no "
+                f"node{did_you_mean(name, model.nodes)}; drop it, or "
+                "rename it"
+            )
 
 
 def _check_net(net: BayesNet, model: Model, learned: Sequence[str]) -> None:
@@ -236,14 +233,18 @@ def _plain(value: Any) -> Any:
 def _begin(name: str, table: np.ndarray, start: Mapping[str, Any]) -> np.ndarray:
     if name not in start:
         return table
-    given = np.asarray(start[name], dtype=float)
-    if given.shape != table.shape or not np.allclose(given.sum(axis=-1), 1.0) or (given < 0).any():
+    wanted = f"give probabilities of shape {table.shape}, whose rows sum to 1"
+    try:
+        given = np.asarray(start[name], dtype=float)
+    except (TypeError, ValueError):
         raise ModelError(
-            f"fit: start of {name!r} has shape {given.shape}; give probabilities of shape "
-            f"{table.shape}, whose rows sum "
-            "to 1"
-        )
-    return given
+            f"fit: start of {name!r} is no array of numbers, but {start[name]!r}; {wanted}"
+        ) from None
+    if given.shape != table.shape:
+        raise ModelError(f"fit: start of {name!r} has shape {given.shape}; {wanted}")
+    if not np.allclose(given.sum(axis=-1), 1.0) or (given < 0).any():
+        raise ModelError(f"fit: start of {name!r} is no table of probabilities; {wanted}")
+    return given / given.sum(axis=-1, keepdims=True)
 
 
 def _check_names(start: Mapping[str, Any], begin: Tables) -> None:

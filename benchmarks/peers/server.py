@@ -1,9 +1,9 @@
 """A peer that waits: prepared once, then one line in, one line out, so that runs interleave.
 
 ``python server.py JOB NETWORK [DRAWS]`` prints ``{"ready": JOB}``. Each line on stdin is an object
-``{"evidence": {node: state}, "answer": bool}`` and is answered by ``{"seconds": s}``, with
-``"marginals": {node: {state: p}}`` where the answer is asked for, or by ``{"error": text}``. The
-clock runs here, around the peer's own work: no pipe is timed. The end of stdin ends the server.
+``{"evidence": {node: state}, "answer": bool}`` and is answered by ``{"seconds": s, "cpu_seconds": c}``,
+with ``"marginals": {node: {state: p}}`` where the answer is asked for, or by ``{"error": text}``. The
+clocks run here, around the peer's own work: no pipe is timed. The end of stdin ends the server.
 """
 
 from __future__ import annotations
@@ -28,9 +28,10 @@ def main(job: str, network: str, draws: str = "100000") -> None:
     for line in sys.stdin:
         request = json.loads(line)
         try:
-            start = time.perf_counter()
+            start, busy = time.perf_counter(), time.process_time()
             marginals = run(request["evidence"])
-            reply: dict = {"seconds": time.perf_counter() - start}
+            busy = time.process_time() - busy
+            reply: dict = {"seconds": time.perf_counter() - start, "cpu_seconds": busy}
         except Exception as error:  # the benchmark goes on without this peer
             reply = {"error": f"{type(error).__name__}: {error}"}
         else:
