@@ -13,7 +13,7 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
-from bayesmc.dbn.calendar import last_times
+from bayesmc.dbn.frames import times_ahead
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
@@ -238,11 +238,12 @@ def forecast(
             "forecast: give the observations so far, or a belief in place of the template"
         )
     problem = pose_series(dbn, observations, inputs, ahead=steps)
-    observations, inputs, times = dbn.unframed(observations, inputs)
+    times = times_ahead(dbn.template, observations, inputs, problem.steps, steps)
+    observations, inputs, _ = dbn.unframed(observations, inputs)
     chosen = engine_for(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
-    found.times = last_times(times, problem.steps, steps)
+    found.times = times
     found.paths = Paths(problem, observations, inputs)
     return found
 
