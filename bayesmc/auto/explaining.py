@@ -10,14 +10,12 @@ from bayesmc.auto.choosing import explained_series
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
-from bayesmc.distributions.parameters import by_keyword
 from bayesmc.engines.base import Engine
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph
 
 
-@by_keyword
 def explain(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Mapping[str, Any] | None = None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import Laplace
-from bayesmc.distributions.parameters import by_keyword
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.approximate.laplace import LaplaceApproximation
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
@@ -38,7 +38,7 @@ _CHEAP = 256 * 2**20
 def infer(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Any = None,
-    *,
+    *beyond: Never,
     inputs: Any = None,
     engine: Any = None,
     rng: Any = None,
@@ -106,6 +106,8 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
+    if beyond:
+        refuse_positions(infer, beyond)
     if executor is not None:
         check_executor("infer", executor)
     problem = pose_any(net, evidence, inputs, resume)

@@ -7,7 +7,7 @@ import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, KeysView, Mapping
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
@@ -110,7 +110,22 @@ class Named:
 
 
 def by_keyword(call: _Call) -> _Call:
-    """A call that says what to write where an argument that goes by keyword comes by position.
+    """A call whose ``*beyond`` are arguments that go by keyword; its signature does not show them.
+
+    It is no wrapper: warnings count the calls up to the user's own line.
+    """
+    signed = inspect.signature(call)
+    kept = [p for p in signed.parameters.values() if p.kind is not p.VAR_POSITIONAL]
+    call.__signature__ = signed.replace(parameters=kept)  # type: ignore[attr-defined]
+    return call
+
+
+def refuse_positions(call: Callable[..., Any], beyond: tuple[Any, ...]) -> NoReturn:
+    """Raise for arguments by position that go by keyword, with what to write.
+
+    Raises
+    ------
+    TypeError
 
     Examples
     --------
@@ -123,18 +138,9 @@ def by_keyword(call: _Call) -> _Call:
     parameters = inspect.signature(call).parameters.values()
     leading = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
     named = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
-
-    @functools.wraps(call)
-    def checked(*args: Any, **options: Any) -> Any:
-        if len(args) > len(leading):
-            meant = _looks_like(args[len(leading)], named)
-            raise TypeError(
-                f"{call.__name__} takes what follows {leading[-1]} by keyword; write "
-                f"{call.__name__}({', '.join([*leading, f'{meant}=...'])})"
-            )
-        return call(*args, **options)
-
-    return checked  # type: ignore[return-value]
+    written = ", ".join([*leading, f"{_looks_like(beyond[0], named)}=..."])
+    name = call.__name__
+    raise TypeError(f"{name} takes what follows {leading[-1]} by keyword; write {name}({written})")
 
 
 def read_floats(value: Any) -> np.ndarray:
