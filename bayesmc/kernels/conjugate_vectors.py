@@ -22,7 +22,10 @@ from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Call,
     Constant,
+    Elementwise,
     Expression,
+    Gather,
+    Pick,
     TracedArray,
     as_expression,
     broadcast,
@@ -256,7 +259,7 @@ def _multiples(cov: Expression, name: str, numbers: np.ndarray) -> tuple[Express
     if times is None or at is None or place is not as_expression(in_place):
         raise TraceError("it is no multiple")
     # features say nothing of what is added
-    if not is_all(affine(whole, [own.name]).offset, 0):
+    if not _vanishes(affine(whole, [own.name]).offset):
         raise TraceError("it is a multiple and more")
     return times, at
 
@@ -289,6 +292,20 @@ def _inverse_multiples(
     within, at = _multiples(inverse.operands[0], name, numbers)
     within, at = (gather(reshape(e, (own.size // block,)), place) for e in (within, at))
     return divide(times, within), at
+
+
+def _vanishes(node: Expression) -> bool:
+    """Whether an expression is zero whatever it reads, as far as this is seen."""
+    if not isinstance(node, Gather | Pick | Elementwise):
+        return is_all(node, 0)
+    inner = [_vanishes(a) for a in node.operands]
+    if isinstance(node, Gather):
+        return inner[0]
+    if isinstance(node, Elementwise) and node.function in (np.multiply, np.divide):
+        return inner[0] or (inner[1] and node.function is np.multiply)
+    choice = isinstance(node, Elementwise) and node.function is np.where
+    same = isinstance(node, Pick) or node.function in (np.add, np.subtract, np.negative)
+    return all(inner[1:] if choice else inner) if choice or same else False
 
 
 def _stacked(parts: list[Expression]) -> Expression:
