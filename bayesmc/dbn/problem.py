@@ -70,10 +70,10 @@ class SeriesProblem:
         """Nodes of a slice whose values are objects."""
         return tuple(n for n in self.slices.dynamic if self.model[n].is_object)
 
-    @property
+    @cached_property
     def known_static(self) -> dict[str, np.ndarray]:
-        """Values of the static nodes that are observed."""
-        return {n: o.value for n, o in self.series.static.items()}
+        """Values of the static nodes that are observed, and of those computed from these."""
+        return with_computed(self.slices, {n: o.value for n, o in self.series.static.items()})
 
     @cached_property
     def unknown_static(self) -> tuple[str, ...]:
@@ -85,6 +85,17 @@ class SeriesProblem:
             if model[n].is_stochastic
             and (n not in self.series.static or self.series.static[n].mask is not None)
         )
+
+
+def with_computed(slices: Slices, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Values of static nodes, and of the static nodes that are computed from these alone."""
+    found = dict(values)
+    with np.errstate(all="ignore"):
+        for name, node in slices.first.nodes.items():  # parents stand before their children
+            if name in slices.template.static and name not in found and not node.is_stochastic:
+                if all(p in found for p in node.parents):
+                    found[name] = np.asarray(slices.first.evaluate(name, found)[0])
+    return found
 
 
 def undrawn(slices: Slices) -> frozenset[str]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.dbn.problem import with_computed
 from bayesmc.dbn.slices import Slices, Template
 from bayesmc.errors import EvidenceError, did_you_mean
 from bayesmc.network.evidence import observe
@@ -34,7 +35,7 @@ def given_static(template: Template, static: Any) -> dict[str, Any]:
 
 
 def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Stored values of static nodes, all of which must be given.
+    """Stored values of static nodes, all of which must be given or computed from those.
 
     Raises
     ------
@@ -59,4 +60,4 @@ def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarr
                 f"static= gives {name!r}, which is no static node with a density"
                 f"{did_you_mean(name, found)}; there are {list(found)}"
             )
-    return found
+    return with_computed(slices, found)
