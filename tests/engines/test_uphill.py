@@ -216,10 +216,9 @@ def test_paths_near_zero_into_a_neck_replace_no_start(monkeypatch: pytest.Monkey
 
 
 def test_one_bad_path_leaves_the_others_good() -> None:
-    """Seeds at which one row of eight ends where the model's own density is none."""
-    for seed in (3, 6):
-        target, _, moved = begun("frailty", seed)
-        assert log_of(target, moved).min() > -2_000
+    """A seed at which one row of eight ends where the model's own density is none."""
+    target, _, moved = begun("frailty", 3)
+    assert log_of(target, moved).min() > -2_000
 
 
 def test_a_good_start_stays_where_it_is() -> None:
