@@ -52,6 +52,9 @@ class BayesNetClassifier(ClassifierMixin, BaseEstimator):
         Dirichlet counts that are added to every entry of a table that is learned; 0 is maximum likelihood.
     bins : int
         Of features that are numbers, without ``net``.
+    handle_unknown : "error" or "ignore"
+        What is done where a row to be classified has a label that is no state: it is refused, or counts as
+        missing.
 
     Attributes
     ----------
@@ -94,12 +97,14 @@ class BayesNetClassifier(ClassifierMixin, BaseEstimator):
         learn: bool = True,
         counts: float = 1.0,
         bins: int = 8,
+        handle_unknown: str = "error",
     ) -> None:
         self.net = net
         self.target = target
         self.learn = learn
         self.counts = counts
         self.bins = bins
+        self.handle_unknown = handle_unknown
 
     def fit(self, X: Any, y: Any) -> BayesNetClassifier:
         """Learn the tables from rows of features and their classes.
@@ -113,6 +118,8 @@ class BayesNetClassifier(ClassifierMixin, BaseEstimator):
         ------
         ValueError, ModelError, EvidenceError
         """
+        if self.handle_unknown not in ("error", "ignore"):
+            raise ValueError(f"handle_unknown={self.handle_unknown!r}: give 'error' or 'ignore'")
         array, y = validate_data(self, X, y, dtype=None, ensure_all_finite="allow-nan", reset=True)
         check_classification_targets(y)
         self.classes_, codes = np.unique(y, return_inverse=True)
@@ -137,7 +144,7 @@ class BayesNetClassifier(ClassifierMixin, BaseEstimator):
         """Probabilities of the classes, shape ``(rows, classes)``, in the order of ``classes_``."""
         check_is_fitted(self)
         array = validate_data(self, X, dtype=None, ensure_all_finite="allow-nan", reset=False)
-        columns = self._coded(_columns(X, array))
+        columns = self._known(self._coded(_columns(X, array)))
         missing = [[v is None or v != v for v in c.tolist()] for c in columns]
         found = []
         for start in range(0, len(array), _AT_ONCE):
@@ -255,6 +262,32 @@ class BayesNetClassifier(ClassifierMixin, BaseEstimator):
             numbers = _numbers(name, column)
             bins = np.searchsorted(edges, numbers, side="right").astype(float)
             found.append(np.where(np.isnan(numbers), np.nan, bins))
+        return found
+
+    def _known(self, columns: list[np.ndarray]) -> list[np.ndarray]:
+        """Columns without labels that are no states.
+
+        Raises
+        ------
+        ValueError
+        """
+        found = []
+        for k, (name, column) in enumerate(zip(self._names, columns, strict=True)):
+            states = self.net_[name].states
+            if column.dtype.kind != "O" or states is None:
+                found.append(column)
+                continue
+            unknown = [v is not None and v not in states for v in column.tolist()]
+            if any(unknown) and self.handle_unknown == "error":
+                odd = sorted({str(v) for v, u in zip(column.tolist(), unknown, strict=True) if u})
+                shown = str(odd[:5])[:-1] + (", ...]" if len(odd) > 5 else "]")
+                raise ValueError(
+                    f"Found unknown categories {shown} in column {k} ({name!r}) during predict; known are "
+                    f'{list(states)}. Give handle_unknown="ignore", which takes them for missing'
+                )
+            column = column.copy()
+            column[unknown] = None
+            found.append(column)
         return found
 
     def _class_order(self) -> list[int]:

@@ -33,6 +33,7 @@ from examples import (
     landmark_localization,
     laser_localization,
     markov_chains,
+    mesquite,
     nile,
     old_faithful,
     parzen,
@@ -64,7 +65,7 @@ FIGURES = (
     laser_localization, sonar_localization, kidnapped_robot, landmark_localization, range_only,
     slam_landmarks, slam_grid,
     coupled_chains, radar_target, bee_dance, gnp_trend_cycle, variational_mixture,
-    fading_channel,
+    fading_channel, mesquite,
     colour_map, talking_head, pedestrians, islands_mpi,
 )  # fmt: skip
 

@@ -28,6 +28,7 @@ from examples import (
     ising_denoising,
     kernels_as_chains,
     markov_chains,
+    mesquite,
     old_faithful,
     parzen,
     picture,
@@ -526,3 +527,32 @@ def test_bioassay_is_that_of_the_book() -> None:
     assert (away < 4 * check.posterior.mcse("line")).all()
     error = check.log_marginal_likelihood - found.exact.log_evidence
     assert abs(error) < 4 * check.log_marginal_likelihood_mcse + 1e-3
+
+
+def test_mesquite_ranks_as_posteriordb_and_the_book_have_it() -> None:
+    """Means to 5 standard errors, a false alarm in 10^4 runs; leave-one-out against Student t densities."""
+    posteriors = mesquite.fitted(500)
+    for name, posterior in posteriors.items():
+        beta, sigma = mesquite.REFERENCE[name].beta, mesquite.REFERENCE[name].sigma
+        share = 5 * np.sqrt(1 + 2000 / 10_000)  # the reference has 10 chains of 1000
+        assert (abs(posterior.mean("beta") - beta) < share * posterior.mcse("beta") + 5e-5).all()
+        assert abs(posterior.mean("sigma") - sigma) < share * posterior.mcse("sigma") + 5e-5
+    found = mesquite.assessed(posteriors)
+    for name in mesquite.LOGS:
+        assert found[name].elpd == pytest.approx(mesquite.exact_elpd(name).sum(), abs=0.25)
+        assert found[name].elpd == pytest.approx(mesquite.REFERENCE[name].elpd, abs=0.25)
+    for figures in (found, mesquite.assessed(posteriors, "waic")):
+        table = bmc.compare({name: figures[name] for name in mesquite.LOGS})
+        assert table.names[-1] == "volume" and set(table.names[:2]) == {
+            "without stems",
+            "volume, area",
+        }
+    pair = bmc.compare({name: found[name] for name in ("volume", "full")})
+    assert pair["volume"]["elpd_diff"] == pytest.approx(mesquite.BOOK_DIFFERENCE, abs=0.4)
+    assert pair["volume"]["dse"] == pytest.approx(mesquite.BOOK_ERROR, abs=0.2)
+    with pytest.raises(bmc.errors.QueryError, match="other numbers were observed.*log_jacobian"):
+        bmc.compare({name: found[name] for name in ("full", "weights")})
+    table = mesquite.of_weights(posteriors)
+    assert table.names[0] == "full" and table["weights"]["warning"]
+    assert table["full"]["elpd"] == pytest.approx(mesquite.BOOK_OF_WEIGHTS, abs=0.5)
+    assert mesquite.exact_elpd("weights").sum() < table["weights"]["elpd"] - 5  # as Pareto k warned

@@ -116,6 +116,28 @@ def test_forests_draw_intervals(chains) -> None:
         chains.plot.forest(prob=95)
 
 
+def test_numbers_are_named_as_summaries_name_them(chains) -> None:
+    ax = chains.plot.forest(["effect[B]", "mu", ("effect", 0)])
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["effect[B]", "mu", "effect[A]"]
+    for wrong, said in (
+        (
+            "effect[C]",
+            r"'effect\[C\]' is no number of 'effect'; its numbers are 'effect\[A\]', 'eff",
+        ),
+        (
+            ("effect", 2),
+            r"shape \(2,\), and 2 names no number of it; name one, such as \('effect', 0\)",
+        ),
+        (("effect", "A"), r"'A' names no number of it"),
+        (("mu", 0), "'mu' is one number, without an index; got 0"),
+        (0, r"names= lists nodes, or numbers of them as 'x\[0\]' or \('x', 0\), not 0"),
+    ):
+        with pytest.raises(bmc.errors.QueryError, match=said):
+            chains.plot.pair(["mu", wrong])
+    with pytest.raises(bmc.errors.UnknownNodeError, match="no node 'efect'"):
+        chains.plot.pair(["mu", "efect"])
+
+
 def test_energies_are_those_of_trajectories() -> None:
     net = bmc.BayesNet(plates={"i": 3})
     net.add("x", bmc.Normal(0.0, 1.0), plates="i")
@@ -253,6 +275,28 @@ def test_predictions_stand_beside_what_was_observed(chains) -> None:
     assert [bar.get_height() for bar in posterior.plot.predictive("sky").patches] == [0.75, 0.25]
     with pytest.raises(bmc.errors.QueryError, match="'rate' was not observed"):
         posterior.plot.predictive("rate")
+
+
+@pytest.mark.parametrize(
+    "made, ends",
+    [
+        (lambda m: bmc.Exponential(np.exp(m)), (0.0, np.inf)),
+        (lambda m: bmc.Beta(1.0, np.exp(m)), (0.0, 1.0)),
+        (lambda m: bmc.Uniform(-1.0, 1.0), (-1.0, 1.0)),
+        (lambda m: bmc.Normal(m, 1.0), (-np.inf, np.inf)),
+    ],
+)
+def test_predicted_densities_end_where_the_support_does(made, ends) -> None:
+    """Of a family that is densest at its end: no mass beyond, and none lost before."""
+    net = bmc.BayesNet(plates={"day": 200})
+    net.add("m", bmc.Normal(0.0, 0.01))
+    net.add("y", made, plates="day")
+    y = net.sample(1, rng=0)["y"][0]
+    posterior = bmc.infer(net, {"y": y}, engine=bmc.LikelihoodWeighting(100), rng=0)
+    for line in posterior.plot.predictive("y", draws=3).lines:
+        points, heights = line.get_xdata(), line.get_ydata()
+        assert points.min() >= ends[0] and points.max() <= ends[1]
+        assert np.trapezoid(heights, points) == pytest.approx(1.0, abs=0.05)
 
 
 def test_marginals_stand_in_the_nodes() -> None:

@@ -129,8 +129,18 @@ def test_what_is_refused(make, words: str) -> None:
 
 def test_states_that_were_not_seen() -> None:
     X, y = patients(40)
-    with pytest.raises(EvidenceError, match="'maybe' is not a state; the states are 'no', 'yes'"):
+    with pytest.raises(
+        ValueError, match=r"unknown categories \['maybe'\] in column 0 \('x0'\).*'no', 'yes'"
+    ):
         BayesNetClassifier().fit(X, y).predict([["maybe", "no"]])
+    patient = BayesNetClassifier(handle_unknown="ignore").fit(X, y)
+    unknown, missing = (
+        patient.predict_proba([["maybe", "no"]]),
+        patient.predict_proba([[None, "no"]]),
+    )
+    np.testing.assert_array_equal(unknown, missing)
+    with pytest.raises(ValueError, match="handle_unknown='drop': give 'error' or 'ignore'"):
+        BayesNetClassifier(handle_unknown="drop").fit(X, y)
     numbers = BayesNetClassifier().fit([[1.0], [2.0]], [0, 1])
     with pytest.raises(EvidenceError, match="feature 'x0' has 'a', and had numbers"):
         numbers.predict([["a"]])

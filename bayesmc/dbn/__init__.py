@@ -3,7 +3,7 @@
 from bayesmc.dbn.problem import UNCOMPARED, SeriesProblem, pose_series, undrawn
 from bayesmc.dbn.series import Row, Series, read_row
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices
-from bayesmc.dbn.static import given_static, read_static
+from bayesmc.dbn.static import given_static, read_static, with_computed
 from bayesmc.dbn.template import DynamicBayesNet
 
 __all__ = [
@@ -20,4 +20,5 @@ __all__ = [
     "read_row",
     "read_static",
     "undrawn",
+    "with_computed",
 ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesmc.dbn.series import Series, read_series
 from bayesmc.dbn.slices import Slices
+from bayesmc.dbn.static import with_computed
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.errors import BayesmcError, ModelError
 from bayesmc.network import Model
@@ -70,10 +71,10 @@ class SeriesProblem:
         """Nodes of a slice whose values are objects."""
         return tuple(n for n in self.slices.dynamic if self.model[n].is_object)
 
-    @property
+    @cached_property
     def known_static(self) -> dict[str, np.ndarray]:
-        """Values of the static nodes that are observed."""
-        return {n: o.value for n, o in self.series.static.items()}
+        """Values of the static nodes that are observed, and of those computed from these."""
+        return with_computed(self.slices, {n: o.value for n, o in self.series.static.items()})
 
     @cached_property
     def unknown_static(self) -> tuple[str, ...]:

@@ -33,8 +33,19 @@ def given_static(template: Template, static: Any) -> dict[str, Any]:
     return dict(static or {})
 
 
+def with_computed(slices: Slices, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Values of static nodes, and of the static nodes that are computed from these alone."""
+    found = dict(values)
+    with np.errstate(all="ignore"):
+        for name, node in slices.first.nodes.items():  # parents stand before their children
+            if name in slices.template.static and name not in found and not node.is_stochastic:
+                if all(p in found for p in node.parents):
+                    found[name] = np.asarray(slices.first.evaluate(name, found)[0])
+    return found
+
+
 def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Stored values of static nodes, all of which must be given.
+    """Stored values of static nodes, all of which must be given or computed from those.
 
     Raises
     ------
@@ -59,4 +70,4 @@ def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarr
                 f"static= gives {name!r}, which is no static node with a density"
                 f"{did_you_mean(name, found)}; there are {list(found)}"
             )
-    return found
+    return with_computed(slices, found)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, TIME, Row, Slices, undrawn
+from bayesmc.dbn import PREVIOUS, TIME, Row, Slices, undrawn, with_computed
 from bayesmc.distributions import Distribution
 from bayesmc.engines.forward import TableDraw, TableWeigh, table_of
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
@@ -61,7 +61,7 @@ class SlicePlan:
         proposals: SliceProposals | None = None,
     ) -> None:
         self.slices, self.apart = slices, apart
-        self.static = static_values(slices, static)
+        self.static = with_computed(slices, static)
         self.proposals = proposals
         #: whether densities that can be followed are read, which takes milliseconds, to be evaluated together
         self.is_read = False
@@ -228,16 +228,6 @@ class SliceProposals:
             )
         self._looks[first, key] = frozenset(found.parents) & _below(self._slices, found.names)
         return found
-
-
-def static_values(slices: Slices, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Static nodes that are known, and what is computed from these alone."""
-    values = dict(given)
-    for name, node in slices.first.nodes.items():
-        if name in slices.template.static and name not in values and not node.is_stochastic:
-            if all(p in values for p in node.parents):
-                values[name], _ = slices.first.evaluate(name, values)
-    return values
 
 
 def plates_apart(slices: Slices) -> tuple[str, ...]:

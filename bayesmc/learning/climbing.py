@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesmc.errors import UnsupportedError
+from bayesmc.learning.fitted import agreeing
 from bayesmc.learning.objectives import Objective
 
-#: starts that are tried, of which the best are climbed from
-_TRIED, _CLIMBED = 32, 3
+#: climbs that are made at least, and at most, where nobody says how many
+_FEWEST, _MOST = 3, 8
+#: starts that are tried where every one takes a search for a grid
+_TRIED_OF_COSTLY = 16
+#: how often a climb goes on from where it ended, with what is found there, and what it must rise by each time
+_ROUNDS, _GAIN = 4, 1e-4
 #: a Newton step that would still raise the maximum by more than so much is one too many
 _RISE = 1e-5
 #: curvature, in nats, below which there is none, and the slope that may be left along such directions
@@ -37,6 +43,8 @@ class Maximum:
     rise : float
         How much higher Newton's step would go; NaN where the curvature is not that of a maximum.
     steps : int
+    ends : ndarray
+        Where all climbs ended, highest first.
     """
 
     u: np.ndarray
@@ -45,6 +53,7 @@ class Maximum:
     hessian: np.ndarray
     rise: float
     steps: int
+    ends: np.ndarray
 
     @property
     def converged(self) -> bool:
@@ -52,18 +61,28 @@ class Maximum:
 
 
 def maximum(
-    objective: Objective, starts: np.ndarray, tolerance: float, max_iterations: int
+    objective: Objective,
+    starts: np.ndarray,
+    tolerance: float,
+    max_iterations: int,
+    climbs: int | None = None,
 ) -> Maximum:
     """The highest of the maxima that climbs from the best starts find.
+
+    Parameters
+    ----------
+    starts : ndarray, shape (starts, size)
+    climbs : int, optional
+        How many; None goes on until two have ended at the highest value, within bounds.
 
     Raises
     ------
     UnsupportedError
         The evidence cannot be told at any start.
     """
-    from scipy.optimize import minimize
-
-    heights = np.array([objective.value(u) for u in starts[:_TRIED]])
+    costly = getattr(objective, "is_costly", False)
+    starts = starts[: max(_TRIED_OF_COSTLY, climbs or 0)] if costly else starts
+    heights = np.array([objective.value(u) for u in starts])
     if not np.isfinite(heights).any():
         refused = getattr(objective, "refused", None)
         why = f": {refused}" if refused is not None else ""
@@ -72,27 +91,17 @@ def maximum(
             "values that "
             "explain them"
         )
-    best: tuple[np.ndarray, float, np.ndarray, int] | None = None
-    for at in np.argsort(-heights)[: 1 if len(starts) == 1 else _CLIMBED]:
-        if not np.isfinite(heights[at]):
-            continue
-        history = [heights[at]]
-
-        def note(u: np.ndarray, kept: list[float] = history) -> None:
-            kept.append(objective.value(u))
-
-        found = minimize(
-            lambda u: min(-objective.value(u), 1e300),
-            starts[at],
-            jac=lambda u: -objective.gradient(u),
-            method="BFGS",
-            callback=note,
-            options={"gtol": tolerance, "maxiter": max_iterations},
-        )
-        if best is None or -found.fun > best[1]:
-            best = (found.x, float(-found.fun), np.array(history), int(found.nit))
-    assert best is not None
-    return _polished(objective, *best)
+    order = [at for at in np.argsort(-heights, kind="stable") if np.isfinite(heights[at])]
+    ended: list[_Climb] = []
+    for at in order[: climbs or _MOST]:
+        if climbs is None and len(ended) >= _FEWEST and agreeing([c.value for c in ended]) > 1:
+            break
+        ended.append(_climbed(objective, starts[at], heights[at], tolerance, max_iterations))
+    best = max(ended, key=lambda climb: climb.value)
+    _settle(objective, best.u)
+    value = objective.value(best.u)
+    ends = np.sort([value if climb is best else climb.value for climb in ended])[::-1]
+    return _polished(objective, best._replace(value=value), ends)
 
 
 def curvature(objective: Objective, u: np.ndarray) -> np.ndarray:
@@ -153,10 +162,50 @@ def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _polished(
-    objective: Objective, u: np.ndarray, value: float, history: np.ndarray, steps: int
-) -> Maximum:
+class _Climb(NamedTuple):
+    u: np.ndarray
+    value: float
+    history: np.ndarray
+    steps: int
+
+
+def _climbed(
+    objective: Objective, start: np.ndarray, height: float, tolerance: float, most: int
+) -> _Climb:
+    """One climb by quasi-Newton steps; what is found at its end may let it go on."""
+    from scipy.optimize import minimize
+
+    u, history, steps = start, [height], 0
+
+    def note(at: np.ndarray) -> None:
+        history.append(objective.value(at))
+
+    for k in range(_ROUNDS):
+        settled = _settle(objective, u)
+        before = objective.value(u)
+        found = minimize(
+            lambda at: min(-objective.value(at), 1e300),
+            u,
+            jac=lambda at: -objective.gradient(at),
+            method="BFGS",
+            callback=note,
+            options={"gtol": tolerance, "maxiter": most - steps},
+        )
+        u, steps = found.x, steps + int(found.nit)
+        if not settled or steps >= most or (k and -found.fun < before + _GAIN):
+            break
+    return _Climb(u, float(-found.fun), np.array(history), steps)
+
+
+def _settle(objective: Objective, u: np.ndarray) -> bool:
+    """Let an objective keep for points near one what it finds there; whether there is anything."""
+    settle = getattr(objective, "settle", None)
+    return bool(settle is not None and settle(u))
+
+
+def _polished(objective: Objective, climb: _Climb, ends: np.ndarray) -> Maximum:
     """Newton's steps at the end, as long as they rise: quasi-Newton ones stop where differences are rough."""
+    u, value, history, steps = climb
     for _ in range(8):
         slope, hessian = objective.gradient(u), curvature(objective, u)
         rise, step = _newton(slope, hessian)
@@ -168,7 +217,8 @@ def _polished(
             break
         u, value, steps = new, higher, steps + 1
         history = np.append(history, higher)
-    return Maximum(u, value, history, hessian, rise, steps)
+    ends = np.append(max(ends[0], value), ends[1:])
+    return Maximum(u, value, history, hessian, rise, steps, ends)
 
 
 def _newton(slope: np.ndarray, hessian: np.ndarray) -> tuple[float, np.ndarray]:

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.auto.choosing import evidence_engine
-from bayesmc.dbn import UNCOMPARED, DynamicBayesNet, SeriesProblem, pose_series
+from bayesmc.dbn import DynamicBayesNet, pose_series
 from bayesmc.dbn.slices import SliceStore
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.question import free_density
@@ -24,8 +23,9 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.learning.climbing import Maximum, maximum, told_part
-from bayesmc.learning.fitted import Fit
+from bayesmc.learning.fitted import Fit, lonely
 from bayesmc.learning.objectives import Density, Evidence, Objective, hidden_numbers
+from bayesmc.learning.series_evidence import of_template
 from bayesmc.learning.tables import fit_tables
 from bayesmc.learning.unknowns import Unknowns
 from bayesmc.network import BayesNet, Problem, pose
@@ -49,6 +49,7 @@ def fit(
     engine: FilterEngine | None = None,
     tolerance: float = 1e-5,
     max_iterations: int = 1000,
+    restarts: int | None = None,
     rng: Any = 0,
 ) -> Fit:
     """Parameters of a net or template by maximum likelihood, or the mode of their posterior.
@@ -81,6 +82,10 @@ def fit(
     tolerance : float
         Of the slope at which it ends; of EM, of the rise by one plain step, in nats.
     max_iterations : int
+    restarts : int, optional
+        How many climbs are made, or how often EM begins; the highest end is taken, and ``climbs`` has them
+        all. Starts are draws of the priors, of tables those of the net and then random rows. None: climbs go
+        on until two end at the same height, three at least and eight at most; EM begins once.
     rng : seed, SeedSequence, Generator or None
         For starts.
 
@@ -100,7 +105,8 @@ def fit(
     -----
     ConvergenceWarning
         It ended before a maximum, at an edge, or where the curvature is singular: the data do not tell a
-        number or a combination of several, or it ran off. They are named, and have no standard error.
+        number or a combination of several, or it ran off. They are named, and have no standard error. Or no
+        other climb came as high, so that there may be higher ones.
 
     Notes
     -----
@@ -132,6 +138,7 @@ def fit(
         )
     if max_iterations < 1:
         raise ModelError(f"fit: max_iterations is {max_iterations}; give 1 or more")
+    _check_restarts(restarts)
     start = start or {}
     data, inputs = _as_dicts(net, data, inputs)
     chosen = _chosen(net, data, inputs, learn)
@@ -146,10 +153,13 @@ def fit(
                 "one after the "
                 "other (learn=)"
             )
-        return fit_tables(net, data, inputs, tables, counts, start, tolerance, max_iterations)
+        again = restarts or 1, np.random.default_rng(seed_sequence(rng))
+        return fit_tables(
+            net, data, inputs, tables, counts, start, tolerance, max_iterations, *again
+        )
     objective, unknowns = _objective(net, data, inputs, chosen, prior, engine)
-    starts = _starts(unknowns, start, np.random.default_rng(seed_sequence(rng)))
-    found = maximum(objective, starts, tolerance, max_iterations)
+    starts = _starts(unknowns, start, np.random.default_rng(seed_sequence(rng)), restarts)
+    found = maximum(objective, starts, tolerance, max_iterations, restarts)
     return _fitted(net, objective, unknowns, found, prior)
 
 
@@ -244,7 +254,9 @@ def _objective(
     engine: FilterEngine | None,
 ) -> tuple[Objective, Unknowns]:
     if isinstance(net, DynamicBayesNet):
-        return _of_template(net, data, inputs, names, prior, engine)
+        series = pose_series(net, data, inputs)
+        _check_observed(series.series.observed, prior)
+        return of_template(net, series, data, inputs, names, prior, engine)
     if engine is not None:
         raise UnsupportedError("fit(engine=...): engines over time are for templates; leave it out")
     problem = pose(net, data, inputs)
@@ -298,54 +310,28 @@ def _by_elimination(
     return Evidence(unknowns, log_evidence, prior)
 
 
-def _of_template(
-    dbn: DynamicBayesNet,
-    data: Mapping[str, Any],
-    inputs: Any,
-    names: tuple[str, ...],
-    prior: bool,
-    engine: FilterEngine | None,
-) -> tuple[Objective, Unknowns]:
-    problem = pose_series(dbn, data, inputs)
-    _check_observed(problem.series.observed, prior)
-    for name in names:
-        if name not in dbn.static_nodes:
-            raise UnsupportedError(
-                f"fit: {name!r} has a value in every slice; static nodes are learned (static), and tables"
-            )
-    left = [n for n in problem.unknown_static if n not in names]
-    if left:
-        raise UnsupportedError(
-            f"fit: the static node {left[0]!r} is neither learned nor observed; name it in learn=, or "
-            "observe it"
-        )
-    unknowns = Unknowns.of(problem.model, names, {})
-    first = unknowns.values(unknowns.starts(1, np.random.default_rng(0))[0])
-    chosen = evidence_engine(pose_series(dbn, {**data, **first}, inputs), engine)
-    seed = np.random.SeedSequence(0)
-
-    def log_evidence(values: Mapping[str, np.ndarray]) -> float:
-        asked: SeriesProblem = pose_series(dbn, {**data, **values}, inputs)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # at parameters that do not fit, filters say so
-            asked.cache[UNCOMPARED] = True
-            found = chosen.filter(asked, seed).log_marginal_likelihood
-        return float(np.sum(found))
-
-    return Evidence(unknowns, log_evidence, prior), unknowns
+def _check_restarts(restarts: Any) -> None:
+    whole = isinstance(restarts, (int, np.integer)) and not isinstance(restarts, bool)
+    if restarts is not None and not (whole and restarts > 0):
+        raise ValueError(f"fit(restarts={restarts!r}): give a whole number of climbs, 1 or more")
 
 
-def _starts(unknowns: Unknowns, start: Mapping[str, Any], rng: np.random.Generator) -> np.ndarray:
+def _starts(
+    unknowns: Unknowns, start: Mapping[str, Any], rng: np.random.Generator, restarts: int | None
+) -> np.ndarray:
     for name in start:
         if name not in unknowns.names:
             raise ModelError(
                 f"fit: start= names {name!r}, which is not learned: {list(unknowns.names)}"
             )
-    drawn = unknowns.starts(_STARTS, rng)
+    if start and len(start) == len(unknowns.names):
+        given = unknowns.numbers(start)[None]
+        if (restarts or 1) == 1:
+            return given
+        return np.vstack([given, unknowns.starts(max(_STARTS, restarts or 1), rng)])
+    drawn = unknowns.starts(max(_STARTS, restarts or 1), rng)
     if not start:
         return drawn
-    if len(start) == len(unknowns.names):
-        return unknowns.numbers(start)[None]
     return np.array([unknowns.numbers({**unknowns.values(u), **start}) for u in drawn])
 
 
@@ -366,11 +352,14 @@ def _fitted(
         at += value.size
     if not found.converged or untold:
         _warn(unknowns, found, untold, spread, prior)
+    elif (alone := lonely(found.ends)) is not None:
+        warnings.warn(f"fit: {alone}", ConvergenceWarning, stacklevel=3)
     what = "posterior mode" if prior else "maximum likelihood"
     log_prior = unknowns.log_prior(found.u) if prior else 0.0
     return Fit(
         _filled(net, values), values, errors, found.value - log_prior, found.value, found.history,
         found.converged and not untold, found.steps, what, covariance, tuple(unknowns.labels()),
+        found.ends,
     )  # fmt: skip
 
 

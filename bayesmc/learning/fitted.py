@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,6 +10,25 @@ import numpy as np
 
 from bayesmc.errors import UnknownNodeError, did_you_mean
 from bayesmc.results.table import Summary
+
+#: nats within which two climbs have ended at the same height
+SAME = 0.01
+
+
+def agreeing(ends: Sequence[float] | np.ndarray) -> int:
+    """How many climbs ended as high as the highest."""
+    return int((np.asarray(ends) > np.max(ends) - SAME).sum())
+
+
+def lonely(ends: np.ndarray) -> str | None:
+    """What to say where only one of several climbs ended at the highest value, or None."""
+    if len(ends) < 2 or agreeing(ends) > 1:
+        return None
+    return (
+        f"starts disagree: of {len(ends)} climbs one ended at {ends[0]:.4f}, and the others "
+        f"{ends[0] - ends[1]:.4g} and more below, so that there may be higher maxima; give more restarts= "
+        "(20, 50), start= near what you expect, or priors that say more"
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +58,8 @@ class Fit:
     covariance : ndarray or None
         Of the numbers in ``labels``.
     labels : tuple of str
+    climbs : ndarray
+        The objective where each climb, or EM, ended, highest first; what is returned is the first.
 
     Examples
     --------
@@ -62,6 +83,7 @@ class Fit:
     method: str
     covariance: np.ndarray | None = field(default=None, repr=False)
     labels: tuple[str, ...] = ()
+    climbs: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values:
@@ -91,9 +113,25 @@ class Fit:
         }
         return Summary(tuple(names), columns, self._title())
 
+    def to_dataframe(self) -> Any:
+        """``summary()`` as a pandas ``DataFrame``, a row for each number.
+
+        Raises
+        ------
+        MissingExtraError
+            Without pandas (the extra ``pandas``).
+        """
+        return self.summary().to_dataframe()
+
+    def _repr_html_(self) -> str:
+        """As notebooks show it."""
+        return self.summary()._repr_html_()
+
     def _title(self) -> str:
         how = "converged" if self.converged else "NOT converged"
         told = f"log likelihood {self.log_likelihood:.4f}, {how} after {self.iterations} iterations"
+        if len(self.climbs) > 1:
+            told += f"; {agreeing(self.climbs)} of {len(self.climbs)} climbs ended there"
         return f"{self.method}: {told}"
 
     def __repr__(self) -> str:

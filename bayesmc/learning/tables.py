@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from bayesmc.errors import (
 )
 from bayesmc.learning.cases import MISSING, Cases
 from bayesmc.learning.expectation_maximisation import Learned, Tables, maximised
-from bayesmc.learning.fitted import Fit
+from bayesmc.learning.fitted import Fit, lonely
 from bayesmc.learning.series_counts import SeriesCounts
 from bayesmc.network import BayesNet, CompiledNode, Model
 from bayesmc.network.columns import array_of
@@ -34,14 +34,18 @@ def fit_tables(
     start: Mapping[str, Any],
     tolerance: float,
     most: int,
+    restarts: int,
+    rng: np.random.Generator,
 ) -> Fit:
     """See ``fit``."""
     if isinstance(net, DynamicBayesNet):
         series = SeriesCounts(net, data, inputs, learned)
         begin = {n: _begin(n, t, start) for n, t in series.tables().items()}
         _check_names(start, begin)
-        found = maximised(series.expected, begin, _dirichlet(begin, counts), tolerance, most)
-        return _fit(series.filled(found.tables), found, counts)
+        found, ends = _highest(
+            series.expected, begin, counts, tolerance, most, _begins(begin, start, restarts, rng)
+        )
+        return _fit(series.filled(found.tables), found, counts, ends)
     if inputs:
         raise UnsupportedError("fit: tables are learned of nets without inputs; leave inputs= out")
     model = net.model()
@@ -79,19 +83,49 @@ def fit_tables(
     def expected(at: Mapping[str, np.ndarray]) -> tuple[float, Mapping[str, np.ndarray]]:
         return cases.expected({**known, **at})
 
-    found = maximised(expected, begin, _dirichlet(begin, counts), tolerance, most)
+    found, ends = _highest(
+        expected, begin, counts, tolerance, most, _begins(begin, start, restarts, rng)
+    )
     declarations = {
         n: replace(d, probs=found.tables[n]) if n in found.tables else d
         for n, d in net.declarations.items()
     }
     filled = BayesNet.of(net.name, declarations, net._plates)
-    return _fit(filled, found, counts)
+    return _fit(filled, found, counts, ends)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _fit(filled: Any, found: Learned, counts: Any) -> Fit:
+def _begins(
+    begin: Tables, start: Mapping[str, Any], restarts: int, rng: np.random.Generator
+) -> Iterator[Tables]:
+    """Tables to begin at: those of the net, then random rows of all that are not given."""
+    yield begin
+    for _ in range(restarts - 1):
+        drawn = {}
+        for name, table in begin.items():
+            rows = rng.standard_gamma(1.0, size=table.shape) * (table > 0)
+            drawn[name] = table if name in start else rows / rows.sum(axis=-1, keepdims=True)
+        yield drawn
+
+
+def _highest(
+    expected: Any,
+    begin: Tables,
+    counts: Any,
+    tolerance: float,
+    most: int,
+    begins: Iterable[Tables],
+) -> tuple[Learned, np.ndarray]:
+    """The highest end of EM, and all, highest first."""
+    added = _dirichlet(begin, counts)
+    found = [maximised(expected, at, added, tolerance, most) for at in begins]
+    best = max(found, key=lambda each: each.objective)
+    return best, np.sort([each.objective for each in found])[::-1]
+
+
+def _fit(filled: Any, found: Learned, counts: Any, ends: np.ndarray) -> Fit:
     if not found.converged:
         warnings.warn(
             f"fit: EM still rose by {found.history[-1] - found.history[-2]:.3g} nats in its last "
@@ -100,6 +134,8 @@ def _fit(filled: Any, found: Learned, counts: Any) -> Fit:
             ConvergenceWarning,
             stacklevel=4,
         )
+    elif (alone := lonely(ends)) is not None:
+        warnings.warn(f"fit: {alone}", ConvergenceWarning, stacklevel=4)
     added = any(
         np.any(np.asarray(c) > 0)
         for c in (counts.values() if isinstance(counts, Mapping) else [counts])
@@ -107,7 +143,7 @@ def _fit(filled: Any, found: Learned, counts: Any) -> Fit:
     how = "EM, posterior mode" if added else "EM, maximum likelihood"
     return Fit(
         filled, found.tables, found.errors, found.log_likelihood, found.objective, found.history,
-        found.converged, len(found.history) - 1, how,
+        found.converged, len(found.history) - 1, how, climbs=ends,
     )  # fmt: skip
 
 

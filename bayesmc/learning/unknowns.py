@@ -141,7 +141,8 @@ class Unknowns:
         """Unconstrained numbers to begin at: the middle of the prior first, then draws of it."""
         draws = []
         with marking_invalid(), np.errstate(all="ignore"):
-            for _ in range(64):
+            total = max(64, count)
+            for _ in range(total):
                 values: dict[str, Any] = dict(self.inputs)
                 try:
                     for p in self.parts:
@@ -156,7 +157,7 @@ class Unknowns:
                 except BayesmcError:  # a prior that cannot be drawn from: flat ones
                     u = rng.normal(size=self.size)
                 draws.append(np.clip(np.nan_to_num(u), -30.0, 30.0 + 10.0 * np.abs(u)))
-        draws_u = np.array(draws).reshape(64, self.size)
+        draws_u = np.array(draws).reshape(total, self.size)
         return np.vstack([np.median(draws_u, axis=0), draws_u])[:count]
 
     def labels(self) -> list[str]:

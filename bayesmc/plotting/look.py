@@ -94,8 +94,15 @@ def chosen_scalars(
     return every[:most], f"the first {most} of {len(every)} numbers; names= says which"
 
 
-def one_scalar(posterior: Any, name: str, index: Any, shape: tuple[int, ...], what: str) -> Scalar:
-    """The number of a node that an index picks.
+def one_scalar(
+    posterior: Any,
+    name: str,
+    index: Any,
+    shape: tuple[int, ...],
+    what: str,
+    given: str = "index={index}",
+) -> Scalar:
+    """The number of a node that an index picks; ``given`` is how that is asked for.
 
     Raises
     ------
@@ -103,14 +110,16 @@ def one_scalar(posterior: Any, name: str, index: Any, shape: tuple[int, ...], wh
         It picks none, or several.
     """
     at = index if isinstance(index, tuple) else (index,)
-    if len(at) == len(shape) and all(-n <= i < n for i, n in zip(at, shape, strict=True)):
+    whole = all(isinstance(i, (int, np.integer)) for i in at) and len(at) == len(shape)
+    if whole and all(-n <= i < n for i, n in zip(at, shape, strict=True)):
         return Scalar(name, at, label_of(posterior, name, at))
     if shape:
         example = 0 if len(shape) == 1 else (0,) * len(shape)
         raise QueryError(
-            f"{what}: {name!r} has shape {shape}; name one number of it, such as index={example}"
+            f"{what}: {name!r} has shape {shape}, and {index!r} names no number of it; name one, such as "
+            f"{given.format(name=name, index=example)}"
         )
-    raise QueryError(f"{what}: {name!r} is one number, without an index; got index={index!r}")
+    raise QueryError(f"{what}: {name!r} is one number, without an index; got {index!r}")
 
 
 def label_of(posterior: Any, name: str, index: tuple[int, ...]) -> str:
@@ -253,7 +262,12 @@ def _of_names(posterior: Posterior, names: Names | None, what: str) -> Iterator[
     else:
         wanted = [names] if isinstance(names, str) else names
     for item in wanted:
-        name, index = item if isinstance(item, tuple) else (item, None)
+        name, index = item if isinstance(item, tuple) and len(item) == 2 else (item, None)
+        if not isinstance(name, str):
+            raise QueryError(
+                f"{what}: names= lists nodes, or numbers of them as 'x[0]' or ('x', 0), not {item!r}"
+            )
+        name, index = _parted(posterior, name, what) if index is None else (name, index)
         for own in expanded(posterior.model, [name]):
             node = posterior._node(own)
             if node.domain is not None and node.domain.labels is not None:
@@ -263,10 +277,31 @@ def _of_names(posterior: Posterior, names: Names | None, what: str) -> Iterator[
                 )
             shape = node.value_shape
             if index is not None:
-                yield one_scalar(posterior, own, index, shape, what)
+                yield one_scalar(posterior, own, index, shape, what, "({name!r}, {index})")
                 continue
             for at in np.ndindex(shape):
                 yield Scalar(own, at, label_of(posterior, own, at))
+
+
+def _parted(posterior: Posterior, name: str, what: str) -> tuple[str, tuple[int, ...] | None]:
+    """A name and None, or of ``x[label]``, as summaries have it, the node and the index of the number.
+
+    Raises
+    ------
+    QueryError
+        The node has no number of this name.
+    """
+    model = posterior.model
+    stems = (name[:k] for k, letter in enumerate(name) if letter == "[")
+    base = next((stem for stem in stems if stem in model.nodes), None)
+    if name in model.nodes or base is None:
+        return name, None
+    shape = posterior._node(base).value_shape
+    labels = {label_of(posterior, base, at): at for at in np.ndindex(shape)}
+    if name not in labels:
+        some = ", ".join(map(repr, list(labels)[:4])) + (", ..." if len(labels) > 4 else "")
+        raise QueryError(f"{what}: {name!r} is no number of {base!r}; its numbers are {some}")
+    return base, labels[name]
 
 
 def _is_drawn(posterior: Posterior, name: str) -> bool:

@@ -31,9 +31,9 @@ def plot_predictive(
 ) -> Axes:
     """Draw how an observed node's values spread, over those of data sets that the posterior predicts.
 
-    Numbers are drawn as densities, one thin line for each predicted data set; counts and states as the share
-    of each value, with the range of 90 % of the predicted shares. A single observed number is a line among
-    what was predicted for it.
+    Numbers are drawn as densities, one thin line for each predicted data set, which end where the node's
+    support does; counts and states as the share of each value, with the range of 90 % of the predicted
+    shares. A single observed number is a line among what was predicted for it.
 
     Parameters
     ----------
@@ -89,18 +89,18 @@ def plot_predictive(
         raise QueryError(
             f"plot_predictive(draws={draws!r}): a whole number of data sets, 1 or more"
         )
-    node, data, predicted = _both(posterior, name, component, int(draws), rng)
+    node, data, predicted, at = _both(posterior, name, component, int(draws), rng)
     ax = single_axes(ax)
     if isinstance(data, StateArray) or data.dtype.kind in "biu" and len(np.unique(data)) <= FEW:
         _draw_shares(ax, node, data, predicted)
     elif data.size == 1:
-        pooled = np.asarray(predicted, dtype=float).ravel()
-        _draw_density(
-            ax, pooled, _points(pooled), {"color": BLUE, "linewidth": 1.4, "label": "predicted"}
-        )
+        pooled, ends = np.asarray(predicted, dtype=float).ravel(), _ends(node, at)
+        style = {"color": BLUE, "linewidth": 1.4, "label": "predicted"}
+        _draw_density(ax, pooled, _points(pooled, ends), ends, style)
         ax.axvline(float(data.ravel()[0]), color=INK, linewidth=1.8, label="observed")
     else:
-        _draw_densities(ax, np.asarray(data, dtype=float), np.asarray(predicted, dtype=float))
+        numbers = np.asarray(data, dtype=float), np.asarray(predicted, dtype=float)
+        _draw_densities(ax, *numbers, _ends(node, at))
     ax.set_xlabel(name, parse_math=False)
     ax.set_ylim(bottom=0)
     ax.legend(frameon=False, fontsize="small", loc="lower left", bbox_to_anchor=(0, 1), ncols=3)
@@ -113,14 +113,16 @@ def plot_predictive(
 
 def _both(
     posterior: Posterior, name: str, component: Any, draws: int, rng: Any
-) -> tuple[CompiledNode, Any, Any]:
-    """The node, what was observed of it, shape (data,), and predictions, shape (draws, data)."""
+) -> tuple[CompiledNode, Any, Any, tuple[int, ...]]:
+    """The node, what was seen of it, shape (data,), predictions, shape (draws, data), and its component."""
     model = posterior.model
     rows = slices_of(model, name) or (posterior._node(name).name,)
     node = model.nodes[rows[0]]
     at: tuple[int, ...] = ()
     if node.event_shape or component != ():
-        at = one_scalar(posterior, name, component, node.event_shape, "plot_predictive").index
+        at = one_scalar(
+            posterior, name, component, node.event_shape, "plot_predictive", "component={index}"
+        ).index
     drawn = posterior.resample(draws, rng=rng).predict(list(rows), rng=rng)
     seen, made = [], []
     for row in rows:
@@ -144,8 +146,26 @@ def _both(
     predicted = np.concatenate(made, axis=1)
     if node.domain is not None and node.domain.labels is not None:
         states = node.domain.states
-        return node, StateArray(data, states), StateArray(predicted, states)
-    return node, data, predicted
+        return node, StateArray(data, states), StateArray(predicted, states), at
+    return node, data, predicted, at
+
+
+def _ends(node: CompiledNode, at: tuple[int, ...]) -> tuple[float, float]:
+    """Where the support of a node's number ends, whatever its parents are; infinite where it may differ."""
+    support = node.support or node.reach
+    if support is not None and support.kind == "product" and len(at) == 1:
+        place, component = 0, at[0] % node.event_shape[0]
+        for part, count in support.parts:
+            place += max(count, 1)
+            if component < place:
+                support = part
+                break
+    if support is None or support.kind not in ("interval", "simplex"):
+        return -np.inf, np.inf
+    if support.kind == "simplex":
+        return 0.0, 1.0
+    whole = support.at_most
+    return float(np.min(whole.low)), float(np.max(whole.high))
 
 
 def _of_entries(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -179,34 +199,49 @@ def _draw_shares(ax: Axes, node: CompiledNode, data: Any, predicted: Any) -> Non
     ax.set_ylabel("share")
 
 
-def _draw_densities(ax: Axes, data: np.ndarray, predicted: np.ndarray) -> None:
+def _draw_densities(
+    ax: Axes, data: np.ndarray, predicted: np.ndarray, ends: tuple[float, float]
+) -> None:
     both = np.concatenate([data, predicted.ravel()[:: max(1, predicted.size // 10_000)]])
-    points = _points(both, data)
+    points = _points(both, ends, data)
     for k, own in enumerate(predicted):
-        style = {"color": BLUE, "linewidth": 0.6, "alpha": 0.35}
-        _draw_density(
-            ax, own, points, {**style, "label": f"{len(predicted)} predicted" if not k else None}
-        )
-    _draw_density(ax, data, points, {"color": INK, "linewidth": 1.8, "label": "observed"})
+        style: dict[str, Any] = {"color": BLUE, "linewidth": 0.6, "alpha": 0.35}
+        style["label"] = f"{len(predicted)} predicted" if not k else None
+        _draw_density(ax, own, points, ends, style)
+    _draw_density(ax, data, points, ends, {"color": INK, "linewidth": 1.8, "label": "observed"})
     ax.set_yticks([])
     ax.set_xlim(points[0], points[-1])
 
 
-def _points(values: np.ndarray, also: np.ndarray | None = None) -> np.ndarray:
-    """Where densities are drawn: the central part of all, and all that was observed."""
+def _points(
+    values: np.ndarray, ends: tuple[float, float], also: np.ndarray | None = None
+) -> np.ndarray:
+    """Where densities are drawn: the central part of all, and all that was observed, within the support."""
     low, high = np.quantile(values, [0.005, 0.995])
     if also is not None:
         low, high = min(low, also.min()), max(high, also.max())
     room = 0.08 * (high - low) or 0.5
-    return np.linspace(low - room, high + room, 300)
+    return np.linspace(max(low - room, ends[0]), min(high + room, ends[1]), 300)
 
 
-def _draw_density(ax: Axes, values: np.ndarray, points: np.ndarray, style: dict[str, Any]) -> None:
-    """A kernel density, of the same width rule for all: Scott's, with a robust spread."""
+def _draw_density(
+    ax: Axes,
+    values: np.ndarray,
+    points: np.ndarray,
+    ends: tuple[float, float],
+    style: dict[str, Any],
+) -> None:
+    """A kernel density, of the same width rule for all: Scott's, with a robust spread.
+
+    What kernels have beyond the ends of the support is folded back (Silverman 1986, sec. 2.10).
+    """
     spread = min(
         values.std(), (np.quantile(values, 0.75) - np.quantile(values, 0.25)) / 1.349 or np.inf
     )
     width = (spread or 0.01 * (points[-1] - points[0])) * len(values) ** -0.2
     kept = values[:: max(1, len(values) // 5000)]
-    z = (points[:, None] - kept) / width
-    ax.plot(points, np.exp(-0.5 * z * z).mean(axis=1) / (width * np.sqrt(2 * np.pi)), **style)
+    height = np.zeros(len(points))
+    for turned in (kept, *(2 * end - kept for end in ends if np.isfinite(end))):
+        z = (points[:, None] - turned) / width
+        height += np.exp(-0.5 * z * z).mean(axis=1) / (width * np.sqrt(2 * np.pi))
+    ax.plot(points, height, **style)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from bayesmc.results.criteria import Elpd, leave_one_out, widely_applicable
 from bayesmc.results.over_time import slices_of
 from bayesmc.results.pointwise import log_likelihood, observed_nodes, refuse_unobserved
 from bayesmc.results.predicted import check_predictions
+from bayesmc.results.scales import Scale, scale_of
 from bayesmc.results.table import Summary
 
 
@@ -49,13 +51,17 @@ class Assessed:
         """
         raise self._cannot("log_likelihood")
 
-    def loo(self, *names: str) -> Elpd:
+    def loo(self, *names: str, log_jacobian: Any = None) -> Elpd:
         """Expected log predictive density by leaving out one observation at a time (PSIS-LOO).
 
         Parameters
         ----------
         names : str
             Observed nodes; all of them where none is named, each element of their plates by itself.
+        log_jacobian : array_like or dict, optional
+            Where a node observes z = f(y) and y is to be predicted: log |dz/dy| of each observation, which
+            broadcasts to the node's plates (``-np.log(y)`` for z = log y); a dict from node to array where
+            there are several.
 
         Returns
         -------
@@ -92,7 +98,7 @@ class Assessed:
         """
         raise self._cannot("loo")
 
-    def waic(self, *names: str) -> Elpd:
+    def waic(self, *names: str, log_jacobian: Any = None) -> Elpd:
         """The widely applicable information criterion, on the scale of ``loo``, mostly the better one."""
         raise self._cannot("waic")
 
@@ -172,13 +178,22 @@ class AssessedByDraws(Assessed):
         stored = {**{n: v[None, None] for n, v in self._inputs.items()}, **self._stored}
         return log_likelihood(problem.model, seen, stored, self._shape, chosen)
 
-    def loo(self, *names: str) -> Elpd:
+    def loo(self, *names: str, log_jacobian: Any = None) -> Elpd:
         distinct = None if self.ancestors is None else len(np.unique(self.ancestors))
-        told = self._unweighted_likelihood("loo", names)
-        return leave_one_out(told, self._relative_ess(), distinct)
+        told, scale = self._scaled_likelihood("loo", names, log_jacobian)
+        return replace(leave_one_out(told, self._relative_ess(), distinct), scale=scale)
 
-    def waic(self, *names: str) -> Elpd:
-        return widely_applicable(self._unweighted_likelihood("waic", names))
+    def waic(self, *names: str, log_jacobian: Any = None) -> Elpd:
+        told, scale = self._scaled_likelihood("waic", names, log_jacobian)
+        return replace(widely_applicable(told), scale=scale)
+
+    def _scaled_likelihood(
+        self, what: str, names: tuple[str, ...], log_jacobian: Any
+    ) -> tuple[dict[str, np.ndarray], Scale]:
+        """Log densities of what is to be predicted, and what these are densities of."""
+        told = self._unweighted_likelihood(what, names)
+        scale, added = scale_of(what, self.model, self._seen, told, log_jacobian)
+        return {n: log + added[n] if n in added else log for n, log in told.items()}, scale
 
     def _unweighted_likelihood(self, what: str, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         if self.weights is not None:

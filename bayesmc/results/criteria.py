@@ -6,13 +6,14 @@ Smoothing the weights is arviz-stats' affair, by its array interface.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import LowEssWarning, QueryError
+from bayesmc.results.scales import Scale, refuse_other_scales
 from bayesmc.results.table import Summary
 
 
@@ -37,6 +38,8 @@ class Elpd:
         The observed nodes.
     warning : str
         What is doubtful; empty where nothing is.
+    scale : Scale or None
+        What the densities are of, where that is known.
 
     Examples
     --------
@@ -58,6 +61,7 @@ class Elpd:
     good_k: float
     names: tuple[str, ...]
     warning: str = ""
+    scale: Scale | None = None
 
     def __str__(self) -> str:
         many = f"{len(self.pointwise)} observations of {', '.join(self.names)}"
@@ -148,13 +152,15 @@ def widely_applicable(log_likelihood: Mapping[str, np.ndarray]) -> Elpd:
     return _summed("waic", lppd - p_i, p_i, None, np.nan, tuple(log_likelihood), warning)
 
 
-def compare(models: Mapping[str, Any], criterion: str = "loo") -> Summary:
+def compare(models: Mapping[str, Any] | Sequence[Any], criterion: str = "loo") -> Summary:
     """Models ranked by how well they are expected to predict new data.
 
     Parameters
     ----------
-    models : dict
-        Name -> ``Posterior``, or what its ``loo()`` or ``waic()`` returned; all given the same observations.
+    models : dict, or sequence of posteriors
+        Name -> ``Posterior``, or what its ``loo()`` or ``waic()`` returned; all given the same observations,
+        or transformed ones brought to one scale (``log_jacobian=``). Posteriors of nets with
+        names of their own need no others.
     criterion : "loo" or "waic"
         What is asked of posteriors.
 
@@ -168,7 +174,7 @@ def compare(models: Mapping[str, Any], criterion: str = "loo") -> Summary:
     Raises
     ------
     QueryError
-        Other observations, or criteria of different kinds.
+        Other observations, other scales, or criteria of different kinds.
 
     References
     ----------
@@ -195,8 +201,7 @@ def compare(models: Mapping[str, Any], criterion: str = "loo") -> Summary:
     """
     if criterion not in ("loo", "waic"):
         raise QueryError(f"compare(criterion={criterion!r}): give 'loo' or 'waic'")
-    if not isinstance(models, Mapping) or len(models) < 2:
-        raise QueryError("compare: give two models or more, {name: posterior}")
+    models = _by_name(models)
     found = {name: _criterion(name, model, criterion) for name, model in models.items()}
     order = sorted(found, key=lambda name: -found[name].elpd)
     best = found[order[0]]
@@ -207,6 +212,7 @@ def compare(models: Mapping[str, Any], criterion: str = "loo") -> Summary:
                 f"compare: {order[0]!r} has {len(best.pointwise)} observations ({best.kind}), {name!r} "
                 f"{len(other.pointwise)} ({other.kind}); models are compared on the same observations"
             )
+    refuse_other_scales(order, [found[name].scale for name in order])
     rows = [found[name] for name in order]
     away = np.stack([best.pointwise - row.pointwise for row in rows])
     count = len(best.pointwise)
@@ -256,6 +262,27 @@ def _summed(
     return Elpd(
         kind, float(elpd_i.sum()), error, float(p_i.sum()), elpd_i, k, float(good_k), names, warning
     )
+
+
+def _by_name(models: Any) -> Mapping[str, Any]:
+    """Models by name; a sequence of posteriors by the names of their nets."""
+    if isinstance(models, (list, tuple)) and len(models) > 1:
+        names: list[Any] = [getattr(getattr(m, "model", None), "name", None) for m in models]
+        if not all(isinstance(n, str) for n in names) or len(set(names)) < len(names):
+            raise QueryError(
+                f"compare: {len(models)} models in a {type(models).__name__}, which have no names of their "
+                f"own (here {names}); give a dict, compare({{'first': a, 'second': b}}), or give the nets "
+                "names, BayesNet('first')"
+            )
+        return dict(zip(names, models, strict=True))
+    if not isinstance(models, Mapping) or len(models) < 2:
+        found = "one" if isinstance(models, (Mapping, list, tuple)) and models else "none"
+        if not isinstance(models, (Mapping, list, tuple)):
+            found = f"a {type(models).__name__}"
+        raise QueryError(
+            f"compare: give two models or more, as in compare({{'first': a, 'second': b}}), not {found}"
+        )
+    return models
 
 
 def _criterion(name: str, model: Any, criterion: str) -> Elpd:

@@ -73,6 +73,19 @@ def test_a_local_level_is_the_maximum_of_the_dense_gaussian() -> None:
     np.testing.assert_allclose(smoothed.mean("x"), wanted.mean("x"))
 
 
+def test_a_fit_is_a_table_for_notebooks_and_pandas() -> None:
+    pandas = pytest.importorskip("pandas")
+    net = bmc.BayesNet(plates={"i": 4, "k": ["a", "b"]})
+    net.add("m", bmc.Normal(0.0, 10.0), plates="k")
+    net.add("y", lambda m: bmc.Normal(m, 1.0), plates=("k", "i"))
+    found = bmc.fit(net, {"y": np.arange(8.0).reshape(2, 4)}, learn="m")
+    frame = found.to_dataframe()
+    pandas.testing.assert_frame_equal(frame, found.summary().to_dataframe())
+    assert list(frame.index) == ["m[a]", "m[b]"]
+    np.testing.assert_allclose(frame["estimate"], [1.5, 5.5], atol=1e-4)
+    assert "m[a]" in found._repr_html_() and "maximum likelihood" in found._repr_html_()
+
+
 def test_labels_are_summed_out() -> None:
     rng = np.random.default_rng(0)
     z = rng.random(100) < 0.4
@@ -192,3 +205,61 @@ def test_nothing_observed_is_refused() -> None:
     for net, data in ((counts(), {"count": [None] * 4}), (walk(), {"y": [np.nan] * 3})):
         with pytest.raises(EvidenceError, match="nothing is observed"):
             bmc.fit(net, data)
+
+
+def test_climbs_that_disagree_are_counted_and_told() -> None:
+    net = bmc.BayesNet(plates={"i": 40})
+    net.add("m", bmc.Normal(0.0, 10.0))
+    net.add("y", lambda m: bmc.StudentT(1.0, m, 0.3), plates="i")
+    y = np.concatenate([np.full(14, -8.0), np.full(16, 0.0), np.full(10, 8.0)])
+    y = y + 0.1 * np.random.default_rng(0).normal(size=40)
+    found = bmc.fit(net, {"y": y}, restarts=12)
+    assert len(found.climbs) == 12 and found.climbs[0] == found.objective
+    assert (np.diff(found.climbs) <= 0).all() and found.climbs[-1] < found.climbs[0] - 1.0
+    assert abs(float(found["m"])) < 0.2
+    assert "of 12 climbs ended there" in repr(found)
+    with pytest.warns(
+        ConvergenceWarning, match="starts disagree: of 2 climbs one ended at.*restarts="
+    ):
+        lone = bmc.fit(net, {"y": y}, start={"m": -8.0}, restarts=2)
+    assert lone.climbs[0] > lone.climbs[1] + 1.0
+    alone = bmc.fit(net, {"y": y}, start={"m": -8.0})
+    assert len(alone.climbs) == 1 and alone.objective == pytest.approx(lone.climbs[1], abs=1e-3)
+    for wrong in (0, 2.5, True):
+        with pytest.raises(ValueError, match="restarts=.*whole number of climbs"):
+            bmc.fit(net, {"y": y}, restarts=wrong)
+
+
+def test_expectation_maximisation_begins_again() -> None:
+    """Two hidden classes from a start at which they are alike: EM stays there, random starts do not."""
+    net = bmc.BayesNet()
+    net.table("kind", [], [0.5, 0.5])
+    for k in range(4):
+        net.table(f"y{k}", ["kind"], [[0.5, 0.5], [0.5, 0.5]])
+    rng = np.random.default_rng(0)
+    kind = rng.random(300) < 0.4
+    cases = {f"y{k}": (rng.random(300) < np.where(kind, 0.9, 0.1)).astype(int) for k in range(4)}
+    stuck, found = bmc.fit(net, cases), bmc.fit(net, cases, restarts=4)
+    assert len(stuck.climbs) == 1 and len(found.climbs) == 4
+    assert found.log_likelihood > stuck.log_likelihood + 100
+    share = kind.mean()
+    np.testing.assert_allclose(sorted(found["kind"]), [share, 1 - share], atol=0.05)
+
+
+def test_a_grid_is_found_once_for_a_climb_and_tells_what_it_tells_anew() -> None:
+    rng = np.random.default_rng(3)
+    h = np.zeros(12)
+    for t in range(1, 12):
+        h[t] = 0.8 * h[t - 1] + 0.5 * rng.normal()
+    y = np.exp(h / 2) * rng.normal(size=12)
+    dbn = bmc.DynamicBayesNet("volatility")
+    dbn.add_static("k", bmc.HalfNormal(3.0))
+    dbn.add("h", lambda h_prev: bmc.Normal(0.8 * h_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda h, k: bmc.Normal(0.0, k * np.exp(h / 2)))
+    found = bmc.fit(dbn, {"y": y}, restarts=1)
+    filtered = bmc.filter(found.net, {"y": y}, engine=bmc.GridFilter())
+    assert found.log_likelihood == pytest.approx(filtered.log_marginal_likelihood, abs=0.01)
+    k = float(found["k"])
+    for other in (0.9 * k, 1.1 * k):
+        lower = bmc.filter(dbn, {"y": y, "k": other}, engine=bmc.GridFilter())
+        assert lower.log_marginal_likelihood < found.log_likelihood + 0.01

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import warnings
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -160,56 +158,6 @@ def test_predictive_checks_find_what_a_model_misses() -> None:
         bmc.infer(net, {"y": y}).predictive_check("y", {"all": lambda v: v}, rng=0)
 
 
-MESQUITE = {
-    "log": ("d1", "d2", "canopy", "height", "density", "group"),
-    "logvolume": ("volume",),
-    "logva": ("volume", "area", "group"),
-    "logvas": ("volume", "area", "shape", "height", "density", "group"),
-    "logvash": ("volume", "area", "shape", "height", "group"),
-}
-
-
-def test_mesquite_bushes_are_ranked_as_known(reference_data: Path) -> None:
-    """By posteriordb's reference draws: logvash, logva, logvas and log within 0.6, logvolume 7.9 behind."""
-    path = reference_data / "posteriordb" / "data" / "mesquite.json"
-    if not path.exists():
-        pytest.skip("no mesquite.json in the data folder")
-    data = {k: np.asarray(v, dtype=float) for k, v in json.loads(path.read_text()).items()}
-    d1, d2, canopy = (np.log(data[k]) for k in ("diam1", "diam2", "canopy_height"))
-    column = {
-        "d1": d1, "d2": d2, "canopy": canopy, "height": np.log(data["total_height"]),
-        "density": np.log(data["density"]), "group": data["group"], "volume": d1 + d2 + canopy,
-        "area": d1 + d2, "shape": d1 - d2,
-    }  # fmt: skip
-    posteriors = {}
-    for name, chosen in MESQUITE.items():
-        design = np.stack([np.ones(46), *(column[c] for c in chosen)], axis=-1)
-        net = bmc.BayesNet(name, plates={"bush": 46})
-        wide = np.full(design.shape[1], 1e3)
-        net.add("beta", bmc.MvNormal(np.zeros(len(wide)), scale_diag=wide))
-        net.add("sigma", bmc.HalfCauchy(100.0))
-        net.add(
-            "y",
-            lambda beta, sigma, at=design: bmc.Normal(np.vecdot(at, beta), sigma),
-            plates="bush",
-        )
-        engine = bmc.Gibbs(1000, warmup=500)
-        posteriors[name] = bmc.infer(net, {"y": np.log(data["weight"])}, engine=engine, rng=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LowEssWarning)
-        table = bmc.compare(posteriors)
-    assert table.names[:2] == ("logvash", "logva") and table.names[-1] == "logvolume"
-    known = {
-        "log": -19.38,
-        "logvolume": -26.73,
-        "logva": -19.03,
-        "logvas": -19.37,
-        "logvash": -18.85,
-    }
-    for name, elpd in known.items():
-        assert table[name]["elpd"] == pytest.approx(elpd, abs=0.4)
-
-
 def test_loo_of_too_few_draws_or_copies_is_refused_by_name() -> None:
     net = bmc.BayesNet(plates={"day": 5})
     net.add("mean", bmc.Normal(0.0, 10.0))
@@ -224,3 +172,46 @@ def test_loo_of_too_few_draws_or_copies_is_refused_by_name() -> None:
             weighted.resample(4000, rng=0).loo()
     enough = bmc.infer(net, seen, engine=bmc.LikelihoodWeighting(20_000), rng=0)
     assert enough.resample(4000, rng=0).loo().elpd == pytest.approx(-6.2, abs=0.3)
+
+
+def line_of(name: str | None, values: np.ndarray) -> Any:
+    net = bmc.BayesNet(name, plates={"i": None})
+    net.add("m", bmc.Normal(0.0, 10.0))
+    net.add("z", lambda m: bmc.Normal(m, 1.0), plates="i")
+    return bmc.infer(net, {"z": values}).resample(1000, rng=0)
+
+
+def test_densities_of_transformed_data_are_brought_to_one_scale_or_refused() -> None:
+    y = np.exp(np.linspace(-1.0, 1.0, 9))
+    raw, logs = line_of("raw", y), line_of("logs", np.log(y))
+    for criterion in ("loo", "waic"):
+        plain = getattr(logs, criterion)()
+        moved = getattr(logs, criterion)(log_jacobian=-np.log(y))
+        np.testing.assert_allclose(moved.pointwise, plain.pointwise - np.log(y), atol=1e-9)
+        assert moved.p == pytest.approx(plain.p, abs=1e-9)
+    with pytest.raises(
+        QueryError, match=r"'z' and 'z'.*other scale.*loo\(log_jacobian=-np.log\(y\)\)"
+    ):
+        bmc.compare({"raw": raw, "logs": logs})
+    with pytest.raises(QueryError, match="log_jacobian= is not the same"):
+        bmc.compare({"moved": logs.loo(log_jacobian={"z": -np.log(y)}), "logs": logs, "raw": raw})
+    shifted = line_of("shifted", y - 1.0)
+    assert bmc.compare({"raw": raw, "moved": shifted.loo(log_jacobian=0.0)}).names
+    for wrong, said in (
+        ({"y": 1.0}, "'y' is none of the observed nodes"),
+        (np.ones(3), r"broadcast to its observations, shape \(9,\), not \(3,\)"),
+        (np.full(9, np.nan), "not finite"),
+    ):
+        with pytest.raises(QueryError, match=said):
+            logs.loo(log_jacobian=wrong)
+
+
+def test_a_list_of_models_is_compared_by_the_names_of_their_nets() -> None:
+    y = np.linspace(-1.0, 1.0, 9)
+    first, second, nameless = line_of("first", y), line_of("second", y), line_of(None, y)
+    assert set(bmc.compare([first, second]).names) == {"first", "second"}
+    for wrong in ([first, nameless], [first, first], [first.loo(), second.loo()]):
+        with pytest.raises(QueryError, match="no names of their own"):
+            bmc.compare(wrong)
+    with pytest.raises(QueryError, match="two models or more.*not one"):
+        bmc.compare([first])

@@ -154,11 +154,11 @@ class ApproximatePosterior(Posterior):
     def log_likelihood(self, *names: str) -> dict[str, np.ndarray]:
         return self._drawn.log_likelihood(*names)
 
-    def loo(self, *names: str) -> Elpd:
-        return self._drawn.loo(*names)
+    def loo(self, *names: str, log_jacobian: Any = None) -> Elpd:
+        return self._drawn.loo(*names, log_jacobian=log_jacobian)
 
-    def waic(self, *names: str) -> Elpd:
-        return self._drawn.waic(*names)
+    def waic(self, *names: str, log_jacobian: Any = None) -> Elpd:
+        return self._drawn.waic(*names, log_jacobian=log_jacobian)
 
     def to_datatree(self, resample: int | None = None, rng: Any = None, **groups: Any) -> Any:
         return self._drawn.to_datatree(resample, rng, **groups)

@@ -269,8 +269,7 @@ class FiniteFilter(FilterEngine):
             absent = frozenset(
                 n for n in problem.slices.dynamic if n not in problem.series.observed
             )
-            static = {n: o.value for n, o in problem.series.static.items()}
             problem.cache[key] = self._planned(
-                problem.slices, static, problem.series, seen, leaves, absent
+                problem.slices, problem.known_static, problem.series, seen, leaves, absent
             )
         return problem.cache[key]

@@ -53,8 +53,7 @@ def rows_compared(problem: SeriesProblem, run: Run) -> Predictive | None:
     """
     if problem.cache.get(UNCOMPARED):
         return None
-    static = {n: o.value for n, o in problem.series.static.items()}
-    plan = SlicePlan(problem.slices, tuple(run.plan.reader.apart), static)
+    plan = SlicePlan(problem.slices, tuple(run.plan.reader.apart), problem.known_static)
     looks = Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK), most=_MOST)
     with quiet():
         for k in range(problem.steps):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, TIME, Slices
+from bayesmc.dbn import PREVIOUS, TIME, Slices, with_computed
 from bayesmc.distributions import Distribution
 from bayesmc.engines.discrete.rows import Key, Piece, Rows, Term, Variable
 from bayesmc.engines.filtering import quiet
@@ -49,7 +49,7 @@ class SliceReader:
         static: Mapping[str, np.ndarray],
     ) -> None:
         self.slices, self.apart, self.variables = slices, apart, variables
-        self.static = _all_static(slices, static)
+        self.static = with_computed(slices, static)
         self.lead = tuple(slices.first.sizes[p] for p in apart)
         self.sequences = math.prod(self.lead)
         self._slow: set[tuple[str, int]] = set()
@@ -420,15 +420,3 @@ def _handed_on(value: np.ndarray, source: CompiledNode, target: CompiledNode) ->
     raise UnsupportedError(
         f"deterministic node {source.name!r} takes other values in slice 0 than later; give it states="
     )
-
-
-def _all_static(slices: Slices, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Static nodes, the deterministic ones computed."""
-    values = dict(known)
-    with quiet():
-        for name, node in slices.first.nodes.items():
-            if name in slices.template.static and name not in values and not node.is_stochastic:
-                above = node.parents
-                if all(p in values for p in above):
-                    values[name] = np.asarray(slices.first.evaluate(name, values)[0])
-    return values

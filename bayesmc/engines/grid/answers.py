@@ -57,8 +57,11 @@ class Answers:
         self.labels = tuple(self.sizes)
         self.held = {s.label: s for s in now.scalars}
 
-    def table(self, name: str) -> np.ndarray:
-        """Probabilities of a finite node's states, shape ``(*plates, states)``."""
+    def table(self, name: str) -> np.ndarray | None:
+        """Probabilities of a finite node's states, shape ``(*plates, states)``.
+
+        None of one that is computed from a hidden node without axes.
+        """
         node = self._node(name)
         assert node.domain is not None
         states = np.arange(node.domain.size)
@@ -70,6 +73,8 @@ class Answers:
                     return found
             hits = (value[..., None] == states).astype(float)
             return self._average(node, hits, 1)
+        if not node.is_stochastic:
+            return None
         dist = self.model.evaluate(self.first, name, self.base)
         self._refuse_bad(node, dist)
         found = self._average(node, dist.probs_table, 1)
@@ -79,7 +84,10 @@ class Answers:
         return np.where(seen.mask[..., None], seen.value[..., None] == states, found)
 
     def moments(self, name: str) -> Moments | None:
-        """Mean and variance of a node of numbers; None for one whose density has no closed ones."""
+        """Mean and variance of a node of numbers.
+
+        None for one whose density has no closed ones, or that is computed from a hidden node without axes.
+        """
         node = self._node(name)
         value = self._value(name)
         if node.domain is not None and value is not None:
@@ -94,6 +102,8 @@ class Answers:
                     assert var is not None
                     return mean, var
             return self._moments(node, value, None)
+        if not node.is_stochastic:
+            return None
         try:
             dist = self.model.evaluate(self.first, name, self.base)
             self._refuse_bad(node, dist)
@@ -147,9 +157,12 @@ class Answers:
             if name not in self.model.slices.dynamic and name not in self.model.static:
                 raise UnknownNodeError(f"a query reads {name!r}, which is no node of a slice")
             if self._value(name) is None:
+                here = self.model.sources(self.first, name).now & self.model.leaves
+                hidden = next((n for n in sorted(here) if self._value(n) is None), name)
+                of = "" if hidden == name else f", which is computed from {hidden!r}"
                 raise QueryError(
-                    f"a query reads {name!r}, which is hidden and not on the grid, since nothing depends on "
-                    f"it; give it one, grid={{{name!r}: (low, high, cells)}}"
+                    f"a query reads {name!r}{of}, which is hidden and not on the grid, since nothing depends "
+                    f"on it; give it one, grid={{{hidden!r}: (low, high, cells)}}"
                 )
         nodes = [self._node(n) for n in names]
 
@@ -337,6 +350,9 @@ class Answers:
         if name in self.model.leaves:
             seen = self.now.row.seen.get(name)
             return seen.value if seen is not None and seen.mask is None else None
+        needed = self.model.sources(self.first, name).now & self.model.leaves
+        if any(self._value(n) is None for n in needed):
+            return None
         return self.model.computed(self.first, name, self.base)
 
     def _used(self, arrays: Sequence[tuple[CompiledNode, np.ndarray, int]]) -> set[Label]:

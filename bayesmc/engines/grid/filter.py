@@ -10,7 +10,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
+from bayesmc.dbn import UNCOMPARED, DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import (
     Asked,
@@ -20,6 +20,7 @@ from bayesmc.engines.filtering import (
     pass_slices,
     quiet,
 )
+from bayesmc.engines.grid.automatic import FoundGrid
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.posterior import (
     GridBelief,
@@ -33,7 +34,6 @@ from bayesmc.engines.grid.posterior import (
 from bayesmc.engines.grid.search import (
     GridOptions,
     GridSearch,
-    known_static,
     too_large,
     unread,
     without_density,
@@ -127,7 +127,7 @@ class GridFilter(GridOptions, FilterEngine):
                 return reason
         try:
             with quiet():
-                model = self.model_on_grid(problem.slices, known_static(problem))
+                model = self.model_on_grid(problem.slices, problem.known_static)
         except BayesmcError as error:
             return str(error)
         name = self._search.automatic(problem)
@@ -139,11 +139,15 @@ class GridFilter(GridOptions, FilterEngine):
         return too_large(model, problem, self.max_bytes) or without_density(problem)
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
-        """Hidden nodes that are integrated out and have no closed moments."""
+        """Hidden nodes that are integrated out and have no closed moments, and what is computed from any."""
         found = []
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.model_on_grid(problem.slices, problem.known_static)
         for name in problem.hidden:
             node = problem.model[name]
+            if name not in model.own:
+                now = model.sources(True, name).now | model.sources(False, name).now
+                found += [name] if now & model.leaves & {*problem.hidden} else []
+                continue
             if name not in model.leaves or node.domain is not None:
                 continue
             with quiet():
@@ -153,6 +157,14 @@ class GridFilter(GridOptions, FilterEngine):
                 except (BayesmcError, NotImplementedError):
                     found.append(name)
         return tuple(found)
+
+    def grid_for(self, problem: SeriesProblem) -> FoundGrid | None:
+        """The grid that it finds for a problem, which serves like problems, too; None where none is found."""
+        return self._search.found(problem)
+
+    def taking(self, problem: SeriesProblem, found: FoundGrid | None) -> None:
+        """Let a problem be filtered on a grid found for another, so that like evidences differ smoothly."""
+        self._search.take(problem, found)
 
     @property
     def _search(self) -> GridSearch:
@@ -166,7 +178,7 @@ class GridFilter(GridOptions, FilterEngine):
         reason = super().unable(problem, asked)
         if reason is not None:
             return reason
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.model_on_grid(problem.slices, problem.known_static)
         return unread(model, asked.queries, problem.hidden)
 
     def is_displaced(self, problem: SeriesProblem) -> bool:
@@ -177,7 +189,7 @@ class GridFilter(GridOptions, FilterEngine):
 
     def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
         grid = self._search.found(problem)
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.model_on_grid(problem.slices, problem.known_static)
         model = model if grid is None else grid.mover.model
 
         def treated(name: str) -> str:
@@ -212,15 +224,20 @@ class GridFilter(GridOptions, FilterEngine):
                 "None, which keeps densities, too"
             )
         mover, kept = self._start(problem)
-        record = GridRecord(mover.model, problem.hidden, problem.steps, queries or {}, keep is None)
-        looks = _looks(problem, mover)
+        alone = bool(problem.cache.get(UNCOMPARED))  # the evidence is all that is asked
+        names = () if alone else problem.hidden
+        record = GridRecord(
+            mover.model, names, problem.steps, queries or {}, keep is None and not alone
+        )
+        looks = None if alone else _looks(problem, mover)
         increments = np.empty((problem.steps, *mover.model.lead))
         before: Cells | None = None
 
         def move(k: int) -> None:
             nonlocal before
             row = problem.series.row(k)
-            looks.look(k, draws_of(mover.model, before), row)
+            if looks is not None:
+                looks.look(k, draws_of(mover.model, before), row)
             cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
             record.add(k, answers_of(mover, before, cells, cells.probs))
@@ -280,7 +297,7 @@ class GridFilter(GridOptions, FilterEngine):
 
         Hidden nodes that nothing reads and that have no grid are integrated out and left out.
         """
-        static = known_static(problem)
+        static = problem.known_static
         with quiet(), Progress(problem.steps, self.label, progress) as bar:
             found_grid = self._search.found(problem)
             axis = None if found_grid is None else (found_grid.name, found_grid.axis)
@@ -329,13 +346,15 @@ class GridFilter(GridOptions, FilterEngine):
         if found is not None:
             return found.mover, found.kept
         with quiet():
-            model = self.model_on_grid(problem.slices, known_static(problem))
+            model = self.model_on_grid(problem.slices, problem.known_static)
             return GridMover(model, self.tolerance), None
 
     def _judged(
-        self, problem: SeriesProblem, found: GridPosterior, looks: Replicates
+        self, problem: SeriesProblem, found: GridPosterior, looks: Replicates | None
     ) -> GridPosterior:
         """With the error of the log evidence, and how rows compare with what was expected."""
+        if looks is None:
+            return found
         found = self._search.with_error(problem, found)
         found.predictive = looks.found(found.steps)
         warn_of_misfit(found.predictive, "GridFilter", found.start, 4)
@@ -377,5 +396,5 @@ class GridFilter(GridOptions, FilterEngine):
 
 def _looks(problem: SeriesProblem, mover: GridMover) -> Replicates:
     """What holds rows against those that the grid expects; the same draws always, as of all it answers."""
-    plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
+    plan = SlicePlan(problem.slices, mover.model.apart, problem.known_static)
     return Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK))

@@ -86,8 +86,12 @@ class GridRecord:
     def _add(self, k: int, answers: Answers) -> None:
         if self.answers is not None:
             self.answers[k] = answers
-        for name, table in self.tables.items():
-            table[k] = answers.table(name)
+        for name in list(self.tables):
+            table = answers.table(name)
+            if table is None:
+                del self.tables[name]
+                continue
+            self.tables[name][k] = table
         for name in list(self.means):
             found = answers.moments(name)
             if found is None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import quiet
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, line_of, read_axes
+from bayesmc.engines.grid.moves import GridMover
 from bayesmc.engines.grid.posterior import GridPosterior
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
@@ -65,11 +66,6 @@ class GridOptions:
             missing = {n: why for n, why in axes.missing.items() if n != name}
             axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
         return GridModel(slices, axes, static, self.max_bytes, logs)
-
-
-def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:
-    """Values of the static nodes."""
-    return {n: o.value for n, o in problem.series.static.items()}
 
 
 def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str | None:
@@ -180,7 +176,7 @@ class GridSearch:
         """The one hidden number of a slice, whose grid is found; None where there is none."""
         if self.options.quadrature != "midpoint":
             return None
-        model = self.options.model_on_grid(problem.slices, known_static(problem))
+        model = self.options.model_on_grid(problem.slices, problem.known_static)
         numbers = _numbers(problem, model)
         if len(numbers) != 1 or numbers[0] in self.options.grid:
             return None
@@ -196,18 +192,32 @@ class GridSearch:
 
     def found(self, problem: SeriesProblem) -> FoundGrid | None:
         """The grid of the one hidden number, found once for a problem; None where there is none to find."""
-        key = f"grid {self.options!r}"
-        if key not in problem.cache:
+        if self._key not in problem.cache:
             with quiet():
-                problem.cache[key] = self._sought(problem)
-        return problem.cache[key]
+                problem.cache[self._key] = self._sought(problem)
+        return problem.cache[self._key]
+
+    def take(self, problem: SeriesProblem, found: FoundGrid | None) -> None:
+        """Answer a problem on the grid found for another with the same nodes, whatever that loses."""
+        if found is not None:
+            axis = found.name, found.axis
+            with quiet():
+                model = self.options.model_on_grid(problem.slices, problem.known_static, axis=axis)
+            unknown = np.full_like(found.error, np.nan)
+            mover = GridMover(model, np.inf)
+            found = replace(found, error=unknown, mover=mover, kept=None)
+        problem.cache[self._key] = found
+
+    @property
+    def _key(self) -> str:
+        return f"grid {self.options!r}"
 
     def _sought(self, problem: SeriesProblem) -> FoundGrid | None:
         name = self.automatic(problem)
         line = None if name is None else line_of(problem.slices, name)
         if name is None or line is None:
             return None
-        static = known_static(problem)
+        static = problem.known_static
         rows = [problem.series.row(k) for k in range(problem.steps)]
 
         def make(axis: Axis) -> GridModel:
@@ -240,7 +250,7 @@ class GridSearch:
                     GridWarning,
                     stacklevel=5,
                 )
-        elif _numbers(problem, self.options.model_on_grid(problem.slices, known_static(problem))):
+        elif _numbers(problem, self.options.model_on_grid(problem.slices, problem.known_static)):
             nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
             posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
         return posterior

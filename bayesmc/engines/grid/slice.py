@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, Row, Slices
+from bayesmc.dbn import PREVIOUS, Row, Slices, with_computed
 from bayesmc.engines.grid.axes import Axes
 from bayesmc.engines.grid.sources import GridStructure, Label, previous
 from bayesmc.errors import BayesmcError, UnsupportedError
@@ -106,10 +106,7 @@ class GridSlices(GridStructure):
         logs: bool = False,
     ) -> None:
         super().__init__(slices, axes, max_bytes, logs)
-        self.static = dict(static)
-        for name in slices.template.static:
-            if not slices.first[name].is_stochastic:
-                self.static[name] = slices.first.evaluate(name, self.static)[0]
+        self.static = with_computed(slices, static)
         self._whole: set[tuple[bool, str]] = set()
         self._open: dict[tuple[bool, str], list[tuple[int, tuple[Any, ...], Any]]] = {}
         self._spread: dict[tuple[bool, str, tuple[Label, ...]], np.ndarray] = {}

@@ -142,7 +142,10 @@ class GridStructure:
         return Sources(frozenset(now), frozenset(before), frozenset(computed), timed)
 
     def _leaves(self) -> frozenset[str]:
-        """Nodes that nothing random and no later slice reads: hidden, they integrate to one."""
+        """Nodes that nothing random and no later slice reads: hidden, they integrate to one.
+
+        Finite ones that computed nodes read are none: their axes cost little, and those are answered for.
+        """
         read = {n for n in self.slices.interface if n in self.own} | {*self.memory}
         for first in (True, False):
             for name in self.own:
@@ -150,6 +153,10 @@ class GridStructure:
             for name in self.slices.interface:
                 if name not in self.own:
                     read |= self.sources(first, name).now
+            for name in self.slices.dynamic:
+                if name not in self.own:
+                    now = self.sources(first, name).now
+                    read |= {n for n in now if self.slices.first[n].domain is not None}
         free = [n for n in self.own if n not in read and n not in self.axes.asked]
         return frozenset(n for n in free if not self.logs or n not in self.axes.of)
 

@@ -78,7 +78,7 @@ class SeriesData:
             Layout(slices, apart, True, before, unknown),
             Layout(slices, apart, False, before, unknown),
         )
-        self.static = {n: o.value for n, o in series.static.items()}
+        self.static = problem.known_static
         self._computed: dict[str, np.ndarray] = {}
         self._plain = tuple(_computed_by_data(layout, given) for layout in self.layouts)
         if any(n in slices.interface for names in self._plain for n in names):

@@ -259,7 +259,7 @@ def _answers(
 ) -> GaussianSeries:  # fmt: skip
     layout, steps, series = data.layouts[0], len(means), problem.series
     known = {n: o.value[:steps] for n, o in series.observed.items() if o.mask is None}
-    known |= {n: o.value for n, o in series.static.items()} | data.computed(steps)
+    known |= problem.known_static | data.computed(steps)
     nodes = layout.slices.first
     known = {n: np.broadcast_to(v, (steps, *nodes[n].value_shape)) for n, v in known.items()}
     view = View(layout, means, spreads, known)

@@ -185,7 +185,7 @@ class SwitchingRun:
         steps, data, series = len(found), self.data, self.problem.series
         model = self.problem.slices.first
         known = {n: series.observed[n].value[:steps] for n in data.known}
-        known |= {n: o.value for n, o in series.static.items()} | data.computed(steps)
+        known |= self.problem.known_static | data.computed(steps)
         known = {n: np.broadcast_to(v, (steps, *model[n].value_shape)) for n, v in known.items()}
         told: dict[str, tuple[Any, Any]] = {
             n: (one[:steps], None if two is None else two[:steps])

@@ -143,7 +143,7 @@ class TablePlan:
     below : frozenset of str
         Nodes with a density that depend on them, and are not integrated out.
     computed : frozenset of str
-        Computed nodes that do.
+        Computed nodes that do, or are told once these are.
     """
 
     names: frozenset[str]
@@ -234,7 +234,8 @@ def planned(
                 if name in group.names or told:
                     found[k, name, kind] = looks[name, kind]
     below = frozenset(n for n in reading if n not in variables)
-    return TablePlan(variables, tuple(groups), readers, found, below, reader.dependent)
+    waiting = reader.dependent | _ends_below(slices, below)
+    return TablePlan(variables, tuple(groups), readers, found, below, waiting)
 
 
 def nodes_read(slices: Slices) -> frozenset[str]:
@@ -295,6 +296,21 @@ def _fault(
                     every = tuple(n for n in slices.dynamic if n in variables)
                     return Fault(every, f"node {name!r} {fault}")
     return None
+
+
+def _ends_below(slices: Slices, below: frozenset[str]) -> frozenset[str]:
+    """Nodes computed from some others in a slice that no density and no later slice needs: they can wait."""
+    found: set[str] = set()
+    needed = {*nodes_read(slices), *slices.interface}
+    for name in slices.dynamic:
+        parents = {*slices.first[name].parents, *slices.later[name].parents}
+        if (
+            not slices.first[name].is_stochastic
+            and name not in needed
+            and parents & (below | found)
+        ):
+            found.add(name)
+    return frozenset(found)
 
 
 def _groups(

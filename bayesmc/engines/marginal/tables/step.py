@@ -86,7 +86,7 @@ class TableFilter:
         for name in self.slices.dynamic:
             if name in self.plan.below and name in seen and name not in full:
                 for model in (self.slices.first, self.slices.later):
-                    for other in self.slices.stochastic:
+                    for other in (n for n in self.slices.dynamic if n not in self.plan.hidden):
                         if {name, name + PREVIOUS} & set(model[other].parents):
                             return name, other
         return None
