@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.distributions.support import Support
+from bayesmc.dbn.by_chance import lags_by_chance
+from bayesmc.dbn.values import UNCOUNTED, computed_domains, counts_that_vary
 from bayesmc.errors import (
-    BayesmcError,
     DensityError,
     ModelError,
     ParameterError,
@@ -268,6 +267,8 @@ class SliceStore:
         self.template = template
         #: values that computed nodes shall have
         self._domains: dict[str, Domain] = {}
+        #: for later slices, of nodes that slice 0 draws and functions compute
+        self._lags: dict[str, Declaration] = {}
         self._two: ModelStore | None = None
         self._one: ModelStore | None = None
         self._found: dict[tuple[int, int], Slices] = {}
@@ -285,18 +286,20 @@ class SliceStore:
             key = (id(first), id(later))
             if key in self._found:
                 return self._found[key]
-            domains = _computed_domains(self.template, first, later)
-            domains |= _counts_that_vary(self.template, first, later)
+            if self._find_lags(first, later):
+                continue
+            domains = computed_domains(self.template, first, later)
+            domains |= counts_that_vary(self.template, first, later)
             if not domains:
                 break
             self._settle(domains)
         else:  # values without end, such as a count of slices
-            self._settle(dict.fromkeys(domains, _UNCOUNTED))
+            self._settle(dict.fromkeys(domains, UNCOUNTED))
             return self.slices(sizes, inputs)
         _check_alike(self.template, first, later)
         while len(self._found) >= 8:
             self._found.pop(next(iter(self._found)))
-        found = self._found[key] = Slices(self.template, first, later)
+        found = self._found[key] = Slices(self._drawn(), first, later)
         return found
 
     def probe(self, sizes: Mapping[str, int | None]) -> Slices:
@@ -323,6 +326,21 @@ class SliceStore:
         node = self.probe(sizes).later[name].record()
         return replace(node, kind="static") if name in self.template.static else node
 
+    def _find_lags(self, first: Model, later: Model) -> bool:
+        """Whether there are nodes, drawn in slice 0 and computed later, that must be compiled again."""
+        own = {n: self.template.later[n] for n in self.template.first}
+        found = lags_by_chance(own, first, later)
+        self._lags.update(found)
+        if found:
+            self._one = self._two = None
+        return bool(found)
+
+    def _drawn(self) -> Template:
+        """The template with every node drawn in all slices, or in none."""
+        if not self._lags:
+            return self.template
+        return replace(self.template, later={**self.template.later, **self._lags})
+
     def _settle(self, domains: Mapping[str, Domain]) -> None:
         """Compile again, with the values that computed nodes have in any slice."""
         self._domains.update(domains)
@@ -330,8 +348,8 @@ class SliceStore:
 
     def _stores(self) -> tuple[ModelStore, ModelStore]:
         if self._one is None or self._two is None:
-            template = self.template
-            template.check()
+            self.template.check()
+            template = self._drawn()
             if self._domains:
 
                 def settled(given: Mapping[str, Declaration]) -> dict[str, Declaration]:
@@ -360,67 +378,6 @@ class SliceStore:
 _OPEN = 3
 #: times that models are compiled to find all values of computed nodes
 _ROUNDS = 6
-#: of a computed node whose values are not counted
-_UNCOUNTED = Domain(0)
-
-
-def _computed_domains(template: Template, first: Model, later: Model) -> dict[str, Domain]:
-    """For computed nodes that have other finite values in slice 0 than later, the values of both."""
-    found = {}
-    for name in template.dynamic:
-        nodes = [(first, first[name]), (later, later[name])]
-        if any(n.is_stochastic or n.declaration.states is not None for _, n in nodes):
-            continue
-        values = [_values(model, node) for model, node in nodes]
-        if all(node.domain is None for _, node in nodes):
-            continue
-        if any(v is None for v in values):
-            found[name] = _UNCOUNTED
-            continue
-        union: np.ndarray = np.unique(np.concatenate([v for v in values if v is not None]))
-        held = [None if node.domain is None else node.domain.numbers for _, node in nodes]
-        if not all(h is not None and np.array_equal(h, union) for h in held):
-            union.flags.writeable = False
-            found[name] = Domain(len(union), values=union)
-    return found
-
-
-def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
-    """Values of a computed node: of its domain, or of a constant."""
-    if node.domain is not None:
-        return node.domain.numbers
-    if node.parents or node.event_shape:
-        return None
-    value = np.asarray(model.probe[node.name])
-    return np.unique(value) if value.dtype.kind in "biu" else None
-
-
-def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[str, Domain]:
-    """Drawn nodes whose values are as many as an input or the time says: no finite set serves all slices."""
-    found = {}
-    given = {n + end for n in (*template.inputs, TIME) for end in ("", PREVIOUS)}
-    for model in (first, later):
-        for name in template.later:
-            node = model.nodes.get(name)
-            if node is None or not node.is_stochastic or node.domain is None:
-                continue
-            read = given & set(node.parents) & set(model.probe)
-            plain = read and node.domain.labels is None
-            moved = _support_further(model, name, read) if plain else None
-            if moved is not None and moved != node.support:
-                found[name] = _UNCOUNTED
-    return found
-
-
-def _support_further(model: Model, name: str, parents: set[str]) -> Support | None:
-    """Where a node's mass lies with some parents' values larger; None where that goes wrong."""
-    moved = {p: np.asarray(model.probe[p]) + 3 for p in parents}
-    try:
-        with marking_invalid(), np.errstate(all="ignore"):
-            dist, _ = model.evaluate(name, {**model.probe, **moved})
-    except BayesmcError:  # a function of the user's, at values that need not be possible
-        return None
-    return dist.support if dist.invalid is None else None
 
 
 def _check_alike(template: Template, first: Model, later: Model) -> None:
