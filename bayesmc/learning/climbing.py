@@ -82,7 +82,8 @@ def maximum(
     """
     costly = getattr(objective, "is_costly", False)
     starts = starts[: max(_TRIED_OF_COSTLY, climbs or 0)] if costly else starts
-    heights = np.array([objective.value(u) for u in starts])
+    several = getattr(objective, "values", None)
+    heights = several(starts) if several else np.array([objective.value(u) for u in starts])
     if not np.isfinite(heights).any():
         refused = getattr(objective, "refused", None)
         why = f": {refused}" if refused is not None else ""
