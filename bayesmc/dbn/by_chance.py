@@ -24,19 +24,19 @@ from bayesmc.distributions import (
 from bayesmc.errors import ModelError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.labels import Domain
-from bayesmc.network.node import Declaration
+from bayesmc.network.node import Declaration, as_lag, way_out_of_lag
 from bayesmc.states import StateArray
 
 
 def lags_by_chance(
     later: Mapping[str, Declaration], drawn: Model, computed: Model
 ) -> dict[str, Declaration]:
-    """Other declarations for later slices of the nodes that have a density in slice 0 only.
+    """Other declarations for later slices of nodes that have a density in slice 0 only.
 
     Parameters
     ----------
     later : dict
-        Name -> declaration in later slices.
+        Name -> declaration in later slices, of these nodes.
     drawn, computed : Model
         What slice 0 and two slices in a row compile to.
 
@@ -45,12 +45,9 @@ def lags_by_chance(
     ModelError
         No point mass has the values that slice 0 draws.
     """
-    found = {}
-    for name, declaration in later.items():
-        zero, own = drawn[name], computed[name]
-        if declaration.source == "function" and zero.is_stochastic and not own.is_stochastic:
-            found[name] = replace(declaration, function=_certain(declaration, _mass(zero, own)))
-    return found
+    return {
+        n: replace(d, function=_certain(d, _mass(drawn[n], computed[n]))) for n, d in later.items()
+    }
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -66,19 +63,15 @@ def _certain(
     def certain(*values: Any) -> Distribution:
         return mass(function(*values))
 
-    return certain
+    return as_lag(certain)
 
 
 def _mass(drawn: CompiledNode, computed: CompiledNode) -> Callable[[Any], Distribution]:
     """What a value for certain is, on the values that slice 0 draws."""
     refused = _refusal(drawn, computed)
     if refused is not None:
-        name = drawn.name
-        raise ModelError(
-            f"node {name!r}: initial= draws it and its function computes it, and {refused}. Give what stood "
-            f"before slice 0 a node of its own, dbn.add('{name}_before', <the density>), and compute "
-            f"{name!r} in all slices, initial=lambda {name}_before: {name}_before"
-        )
+        named = replace(computed.declaration, function=as_lag(lambda: None))
+        raise ModelError(f"node {drawn.name!r}: {refused}. {way_out_of_lag(named)}")
     if not drawn.is_discrete:
         return _vector if drawn.event_shape else _number
     if drawn.domain is None:

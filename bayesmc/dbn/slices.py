@@ -7,7 +7,6 @@ values for the second to be evaluated.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -16,13 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.dbn.by_chance import lags_by_chance
-from bayesmc.dbn.values import UNCOUNTED, computed_domains, counts_that_vary
+from bayesmc.dbn.names import far_back, meant
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.support import Support
 from bayesmc.errors import (
+    BayesmcError,
     DensityError,
     ModelError,
     ParameterError,
     UnknownNodeError,
-    did_you_mean,
 )
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
@@ -42,13 +43,6 @@ TIME = "t"
 _CLOCK = {
     name: Declaration(name, "input", (), (), event_shape=()) for name in (TIME, TIME + PREVIOUS)
 }
-
-#: names by which one may try to look further back: x_prev2, x_prev_prev, x_2prev, x_lag2
-_FAR_BACK = re.compile(r"(.+?)_?(?:prev(?:_?prev)+|prev_?\d+|\d+_?prev|prev_?\d+_prev|lag_?\d+)")
-#: other ways to write that of the slice before
-_TURNED = re.compile(r"(?:prev|previous|last)_(.+)")
-#: names of nodes of the unrolled net
-_UNROLLED = re.compile(r"(.+)\[\d+\]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,27 +82,7 @@ class Template:
 
     def unknown(self, name: str) -> str:
         """That the template has no such node, and which one may be meant."""
-        slice_ = _UNROLLED.fullmatch(name)
-        if slice_ and slice_[1] in self.later:
-            return f"rows go under the name {slice_[1]!r}, time first: row k belongs to slice k"
-        before = [n + PREVIOUS for n in self.later if n not in self.static]
-        turned = _TURNED.fullmatch(name)
-        named = turned[1] + PREVIOUS if turned and turned[1] + PREVIOUS in before else name
-        return (
-            f"the template has no node {name!r}{did_you_mean(named, [*self.later, *before, TIME])}"
-        )
-
-    def further_back(self, name: str) -> str | None:
-        """How to look more than one slice back, if that is what a name is meant for."""
-        far = _FAR_BACK.fullmatch(name)
-        if far is None or far[1] not in self.later or far[1] in self.static:
-            return None
-        own, lag = far[1], f"{far[1]}_lag"
-        how = f"dbn.add({lag!r}, lambda {own}{PREVIOUS}: {own}{PREVIOUS}, initial=...)"
-        return (
-            f"functions look one slice back. Carry what is further back on by a lag node, {how}, and read "
-            f'{lag + PREVIOUS!r} (docs/time.md, "Further back than one slice")'
-        )
+        return meant(name, self.later, self.static)
 
     def check(self) -> None:
         """Refuse parents that are not there, and what has no slice before it in slice 0.
@@ -124,7 +98,7 @@ class Template:
                 stem = parent.removesuffix(PREVIOUS)
                 previous = stem != parent
                 if stem not in known or (previous and stem == TIME):
-                    far = self.further_back(parent)
+                    far = far_back(parent, self.later, self.static)
                     why = (
                         f", but {far}"
                         if far is not None
@@ -288,13 +262,13 @@ class SliceStore:
                 return self._found[key]
             if self._find_lags(first, later):
                 continue
-            domains = computed_domains(self.template, first, later)
-            domains |= counts_that_vary(self.template, first, later)
+            domains = _computed_domains(self.template, first, later)
+            domains |= _counts_that_vary(self.template, first, later)
             if not domains:
                 break
             self._settle(domains)
         else:  # values without end, such as a count of slices
-            self._settle(dict.fromkeys(domains, UNCOUNTED))
+            self._settle(dict.fromkeys(domains, _UNCOUNTED))
             return self.slices(sizes, inputs)
         _check_alike(self.template, first, later)
         while len(self._found) >= 8:
@@ -328,12 +302,13 @@ class SliceStore:
 
     def _find_lags(self, first: Model, later: Model) -> bool:
         """Whether there are nodes, drawn in slice 0 and computed later, that must be compiled again."""
-        own = {n: self.template.later[n] for n in self.template.first}
-        found = lags_by_chance(own, first, later)
-        self._lags.update(found)
-        if found:
+        known, drawn = self.template.first, first.nodes
+        lags = [n for n in known if drawn[n].is_stochastic and not later[n].is_stochastic]
+        if lags:
+            own = {n: self.template.later[n] for n in lags}
+            self._lags.update(lags_by_chance(own, first, later))
             self._one = self._two = None
-        return bool(found)
+        return bool(lags)
 
     def _drawn(self) -> Template:
         """The template with every node drawn in all slices, or in none."""
@@ -378,6 +353,69 @@ class SliceStore:
 _OPEN = 3
 #: times that models are compiled to find all values of computed nodes
 _ROUNDS = 6
+
+
+#: of a computed node whose values are not counted
+_UNCOUNTED = Domain(0)
+
+
+def _computed_domains(template: Template, first: Model, later: Model) -> dict[str, Domain]:
+    """For computed nodes that have other finite values in slice 0 than later, the values of both."""
+    found = {}
+    for name in template.dynamic:
+        nodes = [(first, first[name]), (later, later[name])]
+        if any(n.is_stochastic or n.declaration.states is not None for _, n in nodes):
+            continue
+        values = [_values(model, node) for model, node in nodes]
+        if all(node.domain is None for _, node in nodes):
+            continue
+        if any(v is None for v in values):
+            found[name] = _UNCOUNTED
+            continue
+        union: np.ndarray = np.unique(np.concatenate([v for v in values if v is not None]))
+        held = [None if node.domain is None else node.domain.numbers for _, node in nodes]
+        if not all(h is not None and np.array_equal(h, union) for h in held):
+            union.flags.writeable = False
+            found[name] = Domain(len(union), values=union)
+    return found
+
+
+def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[str, Domain]:
+    """Drawn nodes whose values are as many as an input or the time says: no finite set serves all slices."""
+    found = {}
+    given = {n + end for n in (*template.inputs, TIME) for end in ("", PREVIOUS)}
+    for model in (first, later):
+        for name in template.later:
+            node = model.nodes.get(name)
+            if node is None or not node.is_stochastic or node.domain is None:
+                continue
+            read = given & set(node.parents) & set(model.probe)
+            plain = read and node.domain.labels is None
+            moved = _support_further(model, name, read) if plain else None
+            if moved is not None and moved != node.support:
+                found[name] = _UNCOUNTED
+    return found
+
+
+def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
+    """Values of a computed node: of its domain, or of a constant."""
+    if node.domain is not None:
+        return node.domain.numbers
+    if node.parents or node.event_shape:
+        return None
+    value = np.asarray(model.probe[node.name])
+    return np.unique(value) if value.dtype.kind in "biu" else None
+
+
+def _support_further(model: Model, name: str, parents: set[str]) -> Support | None:
+    """Where a node's mass lies with some parents' values larger; None where that goes wrong."""
+    moved = {p: np.asarray(model.probe[p]) + 3 for p in parents}
+    try:
+        with marking_invalid(), np.errstate(all="ignore"):
+            dist, _ = model.evaluate(name, {**model.probe, **moved})
+    except BayesmcError:  # a function of the user's, at values that need not be possible
+        return None
+    return dist.support if dist.invalid is None else None
 
 
 def _check_alike(template: Template, first: Model, later: Model) -> None:

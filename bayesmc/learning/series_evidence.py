@@ -17,7 +17,6 @@ from bayesmc.learning.objectives import Evidence, steps_around
 from bayesmc.learning.several_points import SeveralPoints
 from bayesmc.learning.unknowns import Unknowns
 
-
 #: points whose evidences and slopes are remembered
 _REMEMBERED = 8
 
@@ -67,7 +66,9 @@ class SeriesEvidence(Evidence):
     def values(self, us: np.ndarray) -> np.ndarray:
         """At several points."""
         found = self._at_once(us)
-        return np.array([super(SeriesEvidence, self).value(u) for u in us]) if found is None else found
+        return (
+            np.array([super(SeriesEvidence, self).value(u) for u in us]) if found is None else found
+        )
 
     def settle(self, u: np.ndarray) -> bool:
         """Keep for points near ``u`` what is found there; False where nothing is, and nothing changes."""
@@ -138,7 +139,9 @@ class SeriesEvidence(Evidence):
             self.engine.taking(asked, self._grid)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # at parameters that do not fit, filters say so
-            found = self.engine.filter(asked, np.random.SeedSequence(0)).log_marginal_likelihood
+            found = self.engine.filter(
+                asked, np.random.SeedSequence(0), progress=False
+            ).log_marginal_likelihood
         return float(np.sum(found))
 
 

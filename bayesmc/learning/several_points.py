@@ -1,7 +1,7 @@
 """The log evidence of a series at several values of its static nodes in one pass: points as one more plate.
 
 A filter treats elements of a plate that never meet side by side, in arrays. So a template with all nodes in a
-plate of points, and each point's values of the static nodes, tells all evidences in little more time than one.
+plate of points, and each point's values of the static nodes, tells all evidences in a little more time.
 """
 
 from __future__ import annotations
@@ -99,7 +99,9 @@ class SeveralPoints:
             asked.cache[UNCOMPARED] = True
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                found = self.engine.filter(asked, np.random.SeedSequence(0)).log_marginal_likelihood
+                found = self.engine.filter(
+                    asked, np.random.SeedSequence(0), progress=False
+                ).log_marginal_likelihood
         except (BayesmcError, ValueError, TypeError, IndexError):  # one by one says what is wrong
             return None
         found = np.asarray(found, dtype=float)
