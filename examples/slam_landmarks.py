@@ -33,7 +33,11 @@ from examples.robot_landmarks import Drive, ellipse, marks_seen, write_mrclam
 
 SPREAD, LASTING = 0.07, 200.0  # of the wheels' gains, as in `landmark_localization`
 PER_METRE, PER_RADIAN, PER_SECOND = 5e-4, 1e-2, 1e-5  # variances that build up, in m^2 and rad^2
-RANGE, BEARING = 0.4, 0.05  # m, rad: wider than one error, which lasts over many readings
+# Wider than one error, which lasts over many readings: m, share of what is read, rad
+RANGE, SHARE, BEARING = 0.3, 0.1, 0.05
+STRAY = 0.002  # share of readings that wear the barcode of another landmark
+# m, m, rad: what a reading of no landmark, or of another one, is about
+ANYWHERE, ANYWHERE_RANGE, ANYWHERE_BEARING = 4.0, 2.0, 0.5
 VAGUE, GUESSED = 30.0, 2.0  # m: standard deviations of a landmark's place beforehand
 # Where it is not known which landmark is read:
 OFF, LASTS = 0.05, 5.0  # shares that ranges are off by, and the seconds for which they are
@@ -118,16 +122,26 @@ def with_marks(dbn: bmc.DynamicBayesNet, mean: Any, scale: float) -> bmc.Dynamic
 
 
 def known_net(start: np.ndarray, mean: Any, scale: float, places: int) -> bmc.DynamicBayesNet:
-    """Readings that say which landmark they are of."""
+    """Readings that say which landmark they are of, and a few of which this is not true.
+
+    A camera tells ranges by how large a barcode looks, so what they are off by grows with them; ``reach`` is
+    the range that was read. A misread barcode is off by metres, and where no state stood for it a single one
+    would leave those particles that are most wrong.
+    """
     dbn = with_marks(robot(start, places), mean, scale)
     dbn.input("which")
+    dbn.input("reach")
+    dbn.add("stray", bmc.Bernoulli(STRAY))
 
     @dbn.node
-    def seen(pose, mark, which):
-        place = mark[which]
+    def seen(pose, mark, which, reach, stray):
+        place, none = mark[which], stray == 1
+        far = np.where(none, ANYWHERE, range_to(pose, place))
+        angle = np.where(none, 0.0, bearing_to(pose, place))
+        wide = np.sqrt(RANGE**2 + (SHARE * reach) ** 2)
         return AndAngle(
-            bmc.Normal(range_to(pose, place), RANGE),
-            bmc.WrappedNormal(bearing_to(pose, place), BEARING),
+            bmc.Normal(far, np.where(none, ANYWHERE_RANGE, wide)),
+            bmc.WrappedNormal(angle, np.where(none, ANYWHERE_BEARING, BEARING)),
         )
 
     return dbn
@@ -193,11 +207,11 @@ def unknown_net(start: np.ndarray, places: int = PLACES) -> bmc.DynamicBayesNet:
     @dbn.node
     def seen(pose, mark, off, number, which):
         k, none = number.astype(int), which == places + 1
-        reach = np.where(none, 4.0, range_to(pose, mark[k]) * (1 + off[k]))
+        reach = np.where(none, ANYWHERE, range_to(pose, mark[k]) * (1 + off[k]))
         angle = np.where(none, 0.0, bearing_to(pose, mark[k]))
         return AndAngle(
-            bmc.Normal(reach, np.where(none, 2.0, FAST_RANGE)),
-            bmc.WrappedNormal(angle, np.where(none, 0.5, FAST_BEARING)),
+            bmc.Normal(reach, np.where(none, ANYWHERE_RANGE, FAST_RANGE)),
+            bmc.WrappedNormal(angle, np.where(none, ANYWHERE_BEARING, FAST_BEARING)),
         )
 
     return dbn
@@ -215,14 +229,36 @@ def first_places(readings: Readings, marks: int) -> np.ndarray:
 
 
 def with_labels(
-    readings: Readings, drive: Drive, engine: Any, guessed: bool = False, seed: int = 0
+    readings: Readings,
+    drive: Drive,
+    engine: Any,
+    guessed: bool = False,
+    seed: int = 0,
+    stray: np.ndarray | None = None,
 ) -> Any:
-    """Beliefs of any engine where it is known which landmark is read."""
+    """Beliefs of any engine, given which landmarks are read, and where known what is misread (``stray``)."""
     marks = len(drive.marks)
     mean, scale = (first_places(readings, marks), GUESSED) if guessed else (np.zeros(2), VAGUE)
-    inputs = {**readings.inputs, "which": np.maximum(readings.which, 0)}
+    reach = np.where(readings.which >= 0, readings.seen[:, 0], 1.0)
+    inputs = {**readings.inputs, "which": np.maximum(readings.which, 0), "reach": reach}
+    rows = {"seen": readings.seen} | ({} if stray is None else {"stray": stray})
     dbn = known_net(drive.start, mean, scale, marks)
-    return bmc.filter(dbn, {"seen": readings.seen}, inputs=inputs, engine=engine, rng=seed)
+    return bmc.filter(dbn, rows, inputs=inputs, engine=engine, rng=seed)
+
+
+def ekf_slam(readings: Readings, drive: Drive, stray: np.ndarray | None = None) -> Any:
+    """The same net under an extended Kalman filter, which has no states: it takes every barcode for right."""
+    if stray is None:
+        stray = np.zeros(len(readings.times), dtype=int)
+    return with_labels(readings, drive, bmc.ExtendedKalmanFilter(), guessed=True, stray=stray)
+
+
+def misread(readings: Readings, marks: np.ndarray) -> np.ndarray:
+    """Readings that by the truth are of another landmark than their barcode says, shape (T,), 0 or 1."""
+    own = marks[np.maximum(readings.which, 0)]
+    far = np.abs(readings.seen[:, 0] - range_to(readings.truth, own)) > 1.2
+    aside = np.abs(wrap(readings.seen[:, 1] - bearing_to(readings.truth, own))) > 0.2
+    return ((far | aside) & (readings.which >= 0)).astype(int)
 
 
 def without_labels(readings: Readings, drive: Drive, engine: Any, seed: int = 0) -> Any:
@@ -306,7 +342,8 @@ def figures(
         readings = one_by_one(drive)
         vague = with_labels(readings, drive, fast_slam(particles))
         same = with_labels(readings, drive, fast_slam(particles), guessed=True)
-        kalman = with_labels(readings, drive, bmc.ExtendedKalmanFilter(), guessed=True)
+        kalman = ekf_slam(readings, drive)
+        told = ekf_slam(readings, drive, misread(readings, drive.marks))
         yield (
             k,
             {
@@ -316,6 +353,8 @@ def figures(
                 "pose, guessed": readings.rmse(same.mean("pose")),
                 "map, EKF-SLAM": map_rmse(kalman.mean("mark")[-1], drive.marks),
                 "pose, EKF-SLAM": readings.rmse(kalman.mean("pose")),
+                "map, EKF-SLAM told what is stray": map_rmse(told.mean("mark")[-1], drive.marks),
+                "pose, EKF-SLAM told what is stray": readings.rmse(told.mean("pose")),
             },
         )
 
@@ -423,7 +462,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     name, drive = log(options.fast)
     readings = one_by_one(drive, 25.0 if options.fast else np.inf)
     found = with_labels(readings, drive, fast_slam(20 if options.fast else 400))
-    kalman = with_labels(readings, drive, bmc.ExtendedKalmanFilter(), guessed=True)
+    kalman = ekf_slam(readings, drive)
     short = one_by_one(drive, 8.0 if options.fast else 150.0)
     engine = fast_slam(10 if options.fast else 30, "off")
     numbers = assigned(without_labels(short, drive, engine))

@@ -113,6 +113,7 @@ def cases(size: float = 1.0) -> dict[str, Case]:
             lambda: regression(), bmc.LikelihoodWeighting(many(250_000)), options={"keep": "draws"}
         ),
         "particle filter": Case(series, filter_, bmc.filter),
+        "islands": Case(series, bmc.IslandFilter(filter_, islands=3, threshold=0.99), bmc.filter),
         "particle Gibbs": Case(lambda: walk(True, 12), particle),
         "particle Metropolis": Case(lambda: walk(True, 12), metropolis),
         "particle filter, late": Case(series, bmc.ParticleFilter(100, delay=4), bmc.filter),

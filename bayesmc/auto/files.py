@@ -16,12 +16,19 @@ import scipy
 
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem
 from bayesmc.engines.unrolled import pose_any
-from bayesmc.errors import CheckpointError, FileFormatError, ModelError, UnsupportedError
+from bayesmc.errors import (
+    CheckpointError,
+    EvidenceError,
+    FileFormatError,
+    ModelError,
+    UnsupportedError,
+)
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.network.digest import digest
 from bayesmc.network.fingerprint import Fingerprint, evidence_fingerprint, fingerprint
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior, RunFile
+from bayesmc.results.many import Posteriors
 from bayesmc.results.run_files import answer_in, difference, header_in, made, remove_units
 from bayesmc.results.saving import ANSWER, RUN
 from bayesmc.states import StateArray
@@ -96,7 +103,7 @@ class Opened:
     Parameters
     ----------
     call : str
-        ``"infer"`` or ``"filter"``.
+        ``"infer"``, ``"infer_many"``, ``"filter"`` or ``"smooth"``.
     checkpoint : path or CheckpointFile
     problem : Problem or SeriesProblem
     named : bool
@@ -124,6 +131,11 @@ class Opened:
                 raise CheckpointError(
                     f"{call}(checkpoint={str(self.path)!r}): the file holds an answer that was saved, and "
                     "no run; give another path (bmc.load reads it)"
+                )
+            if "call" in self.header and self.header["call"] != call:
+                raise CheckpointError(
+                    f"{call}(checkpoint={str(self.path)!r}): the file belongs to a call of "
+                    f"{self.header['call']}; give another path"
                 )
 
     @property
@@ -160,6 +172,7 @@ class Opened:
             identity |= {what: told for what, told in was.items() if what.startswith(own)}
         header: Mapping[str, Any] = self.header or {
             "identity": identity, "engine": engine, "seed": seed, "keep": keep, "named": self.named,
+            "call": self.call,
         }  # fmt: skip
         if self.header is None:
             made(self.path, self.problem, header)
@@ -258,27 +271,45 @@ def _so_far(path: Any) -> tuple[Any, Mapping[str, Any]]:
 
 
 def _with_net(path: Any, answer: Any, header: Mapping[str, Any], net: Any) -> Any:
-    """A posterior with the functions of its net."""
-    if not isinstance(answer, Posterior):
+    """A posterior, or several, with the functions of its net."""
+    if not isinstance(answer, (Posterior, Posteriors)):
         raise ModelError(
             f"load(net=): a {type(answer).__name__} answers without a net; a belief goes on with "
             "engine.start(dbn, belief=bmc.load(path))"
         )
-    inputs = dict(getattr(answer, "_known", {}))
-    evidence = {n: _given(answer.model[n], o) for n, o in answer._seen.items()}
     if isinstance(net, DynamicBayesNet):
         raise ModelError(
             "load(net=): the answer is about an unrolled net; give net=dbn.unroll(steps), with its inputs"
         )
-    problem = pose_any(net, evidence, inputs or None)
-    was = header.get("fingerprint", header.get("identity", {}))
+    if isinstance(answer, Posterior):
+        was = header.get("fingerprint", header.get("identity", {}))
+        answer.bind(_problem_of(path, answer, was, net))
+        return answer
+    prints, whose = header.get("fingerprints", []), iter(header.get("whose", []))
+    problems: list[Problem | None] = []
+    for one in answer.kept():
+        at = None if one is None else next(whose, None)
+        problems.append(None if at is None else _problem_of(path, one, prints[at], net))
+    answer.bind(problems)
+    return answer
+
+
+def _problem_of(path: Any, answer: Any, was: Fingerprint, net: Any) -> Problem:
+    """The question that an answer is about, asked of a net, which must be the same."""
+    inputs = dict(getattr(answer, "_known", {}))
+    evidence = {n: _given(answer.model[n], o) for n, o in answer._seen.items()}
+    try:
+        problem = pose_any(net, evidence, inputs or None)
+    except EvidenceError as error:
+        raise CheckpointError(
+            f"load({str(path)!r}, net=...): the answer is about another net: {error}"
+        ) from error
     now = fingerprint(problem.model)
     if why := difference({k: v for k, v in was.items() if k in now}, now) if was else None:
         raise CheckpointError(
             f"load({str(path)!r}, net=...): the answer is about another net: {why}"
         )
-    answer.bind(problem)
-    return answer
+    return problem
 
 
 def _given(node: Any, seen: Any) -> Any:

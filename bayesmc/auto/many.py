@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.auto.static import able, check_keep, checked_answer, choice
+from bayesmc.auto.files import Opened
+from bayesmc.auto.several import Folder, in_folder, seed_of
+from bayesmc.auto.static import able, check_keep, checked_answer, choice, run_saved
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.exact.many import Prepared, TablePosteriors
 from bayesmc.engines.unrolled import pose_any
-from bayesmc.errors import BayesmcError, EvidenceError, InterruptWarning
+from bayesmc.errors import (
+    BayesmcError,
+    EvidenceError,
+    EvidenceWarning,
+    InterruptWarning,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.network.columns import is_frame, rows_of
 from bayesmc.randomness import child, seed_sequence
@@ -26,6 +36,8 @@ from bayesmc.workers.units import gathered, told_of_interrupt, workers_of
 
 #: units of work for each worker, and questions in one at most: few enough for progress, many enough to travel
 _UNITS, _MOST = 8, 64
+#: impossible sets that a message names
+_NAMED = 10
 
 
 def infer_many(
@@ -37,7 +49,9 @@ def infer_many(
     rng: Any = None,
     progress: bool | None = None,
     keep: str | Sequence[str] = "draws",
+    checkpoint: Any = None,
     executor: Any = None,
+    on_impossible: str = "raise",
 ) -> Posteriors:
     """The posteriors of one net given many evidence sets, each as ``infer`` answers it.
 
@@ -62,8 +76,16 @@ def infer_many(
         Show a bar of units done.
     keep : "draws", "summaries" or a list of node names
         As in ``infer``.
+    checkpoint : path or CheckpointFile, optional
+        A folder in which question k has the file ``set<k>.nc``, as if it were asked about alone with
+        ``infer(checkpoint=)``: the same call goes on where it was. Not where all sets are answered together,
+        which takes less time than their files would.
     executor : concurrent.futures.Executor, optional
         Who answers batches of questions; see ``infer``.
+    on_impossible : "raise" or "nan"
+        What becomes of evidence of probability zero, or of which an engine finds no more. ``"nan"`` answers
+        the other sets: NaN where it is asked about, ``posteriors[k]`` None, and why in
+        ``posteriors.impossible``, with a warning.
 
     Returns
     -------
@@ -74,7 +96,16 @@ def infer_many(
     ------
     EvidenceError, ModelError, UnsupportedError
         With the number of the evidence set. All sets are read before any is answered.
+    ZeroProbabilityError
+        Evidence is impossible, and of which sets, as far as they were asked.
+    CheckpointError, DamagedFileError
+        A file is of another run, and the message says what differs; the disk is full; or it was cut off.
     WorkerError
+
+    Warns
+    -----
+    EvidenceWarning
+        With ``on_impossible="nan"``: which sets are impossible.
 
     Examples
     --------
@@ -87,13 +118,18 @@ def infer_many(
     [[0.308, 0.692], [0.973, 0.027], [0.8, 0.2]]
     """
     check_executor("infer_many", executor)
+    if on_impossible not in ("raise", "nan"):
+        raise ValueError(
+            f'infer_many(on_impossible={on_impossible!r}): give "raise", or "nan" to have the other sets '
+            "answered"
+        )
     sets = _read_sets(evidence)
     given = _read_inputs(inputs, len(sets))
     if not sets:
         return Posteriors([])
     with _in_set(0):
         first = pose_any(net, sets[0], given[0])
-        check_keep("infer_many", keep, first)
+        check_keep("infer_many", keep, first, checkpoint)
         exact = engine
         if engine is None:
             exact = choice(first)
@@ -103,23 +139,39 @@ def infer_many(
         prepared = Prepared.of(first, exact)
         states = None if prepared is None else prepared.states(sets)
         if prepared is not None and states is not None:
-            return _by_tables(prepared, states, progress, executor)
+            if checkpoint is not None:
+                raise UnsupportedError(
+                    "infer_many(checkpoint=...): all sets are answered together here, exactly and in less "
+                    "time than files of each would take; leave it out, and keep the answer by "
+                    "posteriors.save(path)"
+                )
+            return _by_tables(prepared, states, progress, executor, on_impossible)
     problems = [first, *_posed(net, sets, given, first)]
-    return _one_by_one(problems, engine, rng, progress, keep, executor)
+    folder = None if checkpoint is None else Folder("infer_many", checkpoint, "set")
+    if engine is None and folder is not None:
+        engine = folder.engine
+    shared = {
+        "first": first, "engine": engine, "seed": seed_of(folder, rng), "keep": keep,
+        "folder": None if folder is None else folder.file, "on_impossible": on_impossible,
+    }  # fmt: skip
+    return _one_by_one(problems, shared, progress, executor)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
 def _by_tables(
-    prepared: Prepared, states: np.ndarray, progress: bool | None, executor: Any
+    prepared: Prepared,
+    states: np.ndarray,
+    progress: bool | None,
+    executor: Any,
+    on_impossible: str,
 ) -> Posteriors:
     """Blocks of evidence sets on one clique tree."""
     units = list(prepared.units(states))
     shared = {"problem": prepared.problem, "engine": prepared.engine}
     flat: np.ndarray | None = None
     log_z = np.full(len(states), np.nan)
-    done = np.zeros(len(states), dtype=bool)
     prepared.problem.cache["prepared"] = prepared
     starts = np.cumsum([0, *map(len, units)])
     results = completed(
@@ -129,21 +181,28 @@ def _by_tables(
     try:
         for number, (logs, marginals) in results:
             if flat is None:
-                flat = np.empty((len(states), marginals.shape[1]))
+                flat = np.full((len(states), marginals.shape[1]), np.nan)
             at = slice(starts[number], starts[number + 1])
-            log_z[at], flat[at], done[at] = logs, marginals, True
-            if np.isneginf(logs).any():
-                wrong = int(starts[number] + np.flatnonzero(np.isneginf(logs))[0])
-                with _in_set(wrong):  # which piece of evidence is to blame, one question says best
-                    prepared.engine.run(prepared.posed(states[wrong])[0], seed_sequence(0))
+            log_z[at], flat[at] = logs, marginals
     except KeyboardInterrupt:
-        if not done.any():
+        done = int((~np.isnan(log_z)).sum())
+        if not done:
             raise
-        told_of_interrupt(
-            "infer_many", f"{done.sum()} of {len(done)} evidence sets", InterruptWarning
-        )
+        told_of_interrupt("infer_many", f"{done} of {len(log_z)} evidence sets", InterruptWarning)
     assert flat is not None
-    return TablePosteriors(prepared, states, log_z, flat, done)
+    wrong = np.flatnonzero(np.isneginf(log_z)).tolist()
+    flat[wrong] = np.nan
+    impossible = dict.fromkeys(wrong, "the evidence has probability zero")
+    for k in wrong:  # which piece of evidence is to blame, one question says best
+        try:
+            with _in_set(k):
+                prepared.engine.run(prepared.posed(states[k])[0], seed_sequence(0))
+        except ZeroProbabilityError as error:
+            impossible[k] = _why(error, k)
+            if on_impossible == "raise":
+                raise _also(error, wrong) from None
+    _warn(impossible)
+    return TablePosteriors(prepared, states, log_z, flat, np.isfinite(log_z), impossible)
 
 
 def _tables_answered(
@@ -157,41 +216,86 @@ def _tables_answered(
     return found
 
 
+class _Impossible(NamedTuple):
+    """In the place of the answer to a question that has none."""
+
+    why: str
+
+
 def _one_by_one(
-    problems: Sequence[Problem],
-    engine: Any,
-    rng: Any,
-    progress: bool | None,
-    keep: Any,
-    executor: Any,
+    problems: Sequence[Problem], shared: Mapping[str, Any], progress: bool | None, executor: Any
 ) -> Posteriors:
-    seed = seed_sequence(rng)
     size = 1
     if executor is not None:
         size = min(_MOST, max(1, len(problems) // (_UNITS * workers_of(executor))))
     cuts = range(0, len(problems), size)
     units = [(k, list(problems[k : k + size])) for k in cuts]
-    shared = {"first": problems[0], "engine": engine, "seed": seed, "keep": keep}
     results = completed(
         _questions_answered, shared, units, executor,
         label="questions", total=len(units), progress=progress,
     )  # fmt: skip
     starts = [unit[0] for unit in units]
-    return Posteriors(
-        gathered(results, starts, len(problems), "infer_many", "{} of {} evidence sets")
-    )
+    found = gathered(results, starts, len(problems), "infer_many", "{} of {} evidence sets")
+    impossible = {k: one.why for k, one in enumerate(found) if isinstance(one, _Impossible)}
+    _warn(impossible)
+    return Posteriors([None if k in impossible else one for k, one in enumerate(found)], impossible)
 
 
 def _questions_answered(
     shared: Mapping[str, Any], unit: tuple[int, list[Problem]]
-) -> list[Posterior]:
-    found = []
+) -> list[Posterior | _Impossible]:
+    found: list[Posterior | _Impossible] = []
     for k, problem in enumerate(unit[1], unit[0]):
-        with _in_set(k):
-            engine = able(problem, shared["engine"])
-            seed = child(shared["seed"], k)
-            found.append(checked_answer(engine, engine.run(problem, seed, shared["keep"], False)))
+        try:
+            with _in_set(k):
+                found.append(_answered(shared, k, problem))
+        except ZeroProbabilityError as error:
+            if shared["on_impossible"] == "raise":
+                raise
+            found.append(_Impossible(_why(error, k)))
     return found
+
+
+def _answered(shared: Mapping[str, Any], k: int, problem: Problem) -> Posterior:
+    """One question, in a file of its own where one is wanted."""
+    engine, seed, keep = shared["engine"], child(shared["seed"], k), shared["keep"]
+    if shared["folder"] is None:
+        engine = able(problem, engine)
+        return checked_answer(engine, engine.run(problem, seed, keep, False))
+    file = in_folder(shared["folder"], "set", k)
+    opened = Opened("infer_many", file, problem, engine is not None)
+    engine = able(problem, opened.engine if engine is None else engine)
+    return checked_answer(engine, run_saved(opened, engine, seed, keep, False, {}))
+
+
+def _why(error: ZeroProbabilityError, k: int) -> str:
+    return str(error).removeprefix(f"evidence set {k}: ")
+
+
+def _also(error: ZeroProbabilityError, wrong: Sequence[int]) -> ZeroProbabilityError:
+    """The error about the first of some sets, with all of them named."""
+    others = f"; so is that of {_listed(wrong[1:])}" if len(wrong) > 1 else ""
+    fix = 'on_impossible="nan" answers the other sets'
+    return type(error)(f"{error}{others}; {fix}")
+
+
+def _warn(impossible: Mapping[int, str]) -> None:
+    if not impossible:
+        return
+    first = next(iter(impossible))
+    warnings.warn(
+        f"infer_many: there is no posterior of {_listed([*impossible])}, and answers about it are NaN "
+        f"(set {first}: {impossible[first]})",
+        EvidenceWarning,
+        stacklevel=4,
+    )
+
+
+def _listed(sets: Sequence[int]) -> str:
+    """Positions in words, some of very many."""
+    shown = ", ".join(map(str, sets[:_NAMED]))
+    more = f" and {len(sets) - _NAMED} more" if len(sets) > _NAMED else ""
+    return f"set{'' if len(sets) == 1 else 's'} {shown}{more}"
 
 
 def _posed(

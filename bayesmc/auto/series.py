@@ -13,7 +13,7 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.several import Folder, is_several, seed_of, several
 from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
-from bayesmc.dbn.calendar import last_times
+from bayesmc.dbn.frames import times_ahead
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
@@ -142,6 +142,7 @@ def smooth(  # type: ignore[misc]
     queries: Queries | None = None,
     trajectories: int | None = None,
     backward: str | None = None,
+    checkpoint: Any = None,
     executor: Any = None,
 ) -> Any:
     """Beliefs about every slice given all rows, or with ``lag`` given those up to so many slices later.
@@ -166,6 +167,10 @@ def smooth(  # type: ignore[misc]
         many times as lags reach back). With ``marginalize=`` 32 and the ancestor, without rejection.
         ``"exact"`` tries all particles for each.
 
+    checkpoint : path or CheckpointFile, optional
+        A file in which the answer is saved at the end, and nothing before: a smoother goes back over all
+        rows. The same call returns it. Of a list of series a folder, in which each is saved as it is done.
+
     Examples
     --------
     >>> import bayesmc as bmc
@@ -182,12 +187,14 @@ def smooth(  # type: ignore[misc]
         "progress": progress,
     }  # fmt: skip
     if not isinstance(observations, Mapping) and is_several(observations):
-        quiet, seed = {**options, "progress": False}, seed_sequence(rng)
-        return several(
-            "smooth", _smoothed, dbn, observations, inputs, engine, seed, quiet, progress, executor
-        )
+        folder = None if checkpoint is None else Folder("smooth", checkpoint)
+        quiet, seed = {**options, "progress": False}, seed_of(folder, rng)
+        engine = folder.engine if engine is None and folder is not None else engine
+        work = progress, executor, folder
+        return several("smooth", _smoothed, dbn, observations, inputs, engine, seed, quiet, *work)
     problem = pose_series(dbn, observations, inputs)
-    found = _smoothed(problem, engine, seed_sequence(rng), options)
+    own = None if rng is None else seed_sequence(rng)
+    found = _smoothed(problem, engine, own, {**options, "checkpoint": checkpoint})
     observations, inputs, found.times = dbn.unframed(observations, inputs)
     found.paths = Paths(problem, observations, inputs)
     return found
@@ -231,11 +238,12 @@ def forecast(
             "forecast: give the observations so far, or a belief in place of the template"
         )
     problem = pose_series(dbn, observations, inputs, ahead=steps)
-    observations, inputs, times = dbn.unframed(observations, inputs)
+    times = times_ahead(dbn.template, observations, inputs, problem.steps, steps)
+    observations, inputs, _ = dbn.unframed(observations, inputs)
     chosen = engine_for(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
-    found.times = last_times(times, problem.steps, steps)
+    found.times = times
     found.paths = Paths(problem, observations, inputs)
     return found
 
@@ -337,9 +345,40 @@ def _filtered(
 def _smoothed(
     problem: SeriesProblem,
     engine: FilterEngine | None,
-    seed: np.random.SeedSequence,
+    seed: np.random.SeedSequence | None,
     options: dict[str, Any],
 ) -> SeriesPosterior:
+    """A smoothed series, its answer kept in a file where one is wanted."""
+    checkpoint = options.get("checkpoint")
+    options = {n: v for n, v in options.items() if n != "checkpoint"}
+    if checkpoint is None:
+        own = seed_sequence(None) if seed is None else seed
+        return _smoothed_now(problem, engine, own, options)
+    opened = Opened("smooth", checkpoint, problem, engine is not None)
+    if engine is None and opened.header is not None and opened.header.get("named"):
+        engine = opened.engine
+    seed = opened.seed(None) if seed is None else seed
+    chosen = _smoother(problem, engine or opened.engine, options)[0]
+    asked = {n: options[n] for n in ("lag", "queries", "trajectories", "backward")}
+    file, answer = opened.begin(chosen, seed, None, asked)
+    if file is None:
+        return answer
+    with closing(file):
+        found = _smoothed_now(problem, engine, seed, options)
+        if not getattr(found, "interrupted", False) and found.steps == problem.steps:
+            file.finish(found)
+    return found
+
+
+def _smoother(
+    problem: SeriesProblem, engine: FilterEngine | None, options: dict[str, Any]
+) -> tuple[FilterEngine, dict[str, Any]]:
+    """Who smooths, and what it is told besides.
+
+    Raises
+    ------
+    ValueError
+    """
     lag, queries = options["lag"], options["queries"]
     if lag is not None and (
         isinstance(lag, bool) or not isinstance(lag, (int, np.integer)) or lag < 0
@@ -355,9 +394,18 @@ def _smoothed(
             f"smooth({name}={given[name]!r}): it says how particles are smoothed, and "
             f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
         )
+    return chosen, given | {"lag": lag, "queries": queries, "progress": options["progress"]}
+
+
+def _smoothed_now(
+    problem: SeriesProblem,
+    engine: FilterEngine | None,
+    seed: np.random.SeedSequence,
+    options: dict[str, Any],
+) -> SeriesPosterior:
+    chosen, given = _smoother(problem, engine, options)
     if engine is None and isinstance(chosen, ExpectationPropagation):
-        return settled_or_kim(chosen, problem, queries, options["progress"])
-    given |= {"lag": lag, "queries": queries, "progress": options["progress"]}
+        return settled_or_kim(chosen, problem, options["queries"], options["progress"])
     with picks_told(problem.slices, problem.series):
         return chosen.smooth(problem, seed, **given)
 

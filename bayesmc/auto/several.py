@@ -21,6 +21,8 @@ from bayesmc.workers.units import gathered, workers_of
 
 #: units of work for each worker: a slow series holds up little
 _UNITS = 8
+#: what files of a folder are of, in words
+_PLURAL = {"series": "series", "set": "evidence sets"}
 
 #: of a posed problem, an engine or None, a seed and options to the answer
 Answer = Callable[[SeriesProblem, Any, np.random.SeedSequence, dict[str, Any]], SeriesPosterior]
@@ -34,7 +36,7 @@ def is_several(observations: Any) -> bool:
 
 
 class Folder:
-    """Where several series save themselves, each in a file of its own, as if it were asked about alone.
+    """Where several questions save themselves, each in a file of its own, as if it were asked about alone.
 
     Parameters
     ----------
@@ -42,6 +44,8 @@ class Folder:
         ``"filter"``.
     checkpoint : path or CheckpointFile
         Of a folder, made where there is none.
+    kind : str
+        What files are called: ``series0.nc``, ...
 
     Raises
     ------
@@ -49,14 +53,14 @@ class Folder:
         It is a file, or cannot be made.
     """
 
-    def __init__(self, call: str, checkpoint: Any) -> None:
+    def __init__(self, call: str, checkpoint: Any, kind: str = "series") -> None:
         self.file = CheckpointFile.of(checkpoint)
         self.path = Path(self.file.path)
         said = f"{call}(checkpoint={str(self.path)!r})"
         if self.path.exists() and not self.path.is_dir():
             raise CheckpointError(
-                f"{said}: several series are saved in a folder, one file for each, and this is a file; give "
-                "the path of a folder"
+                f"{said}: several {_PLURAL[kind]} are saved in a folder, one file for each, and this is a "
+                "file; give the path of a folder"
             )
         try:
             self.path.mkdir(exist_ok=True)
@@ -67,7 +71,7 @@ class Folder:
 
         #: what a file that is here says of the run; empty where there is none
         self.header: Mapping[str, Any] = {}
-        first = next(self.path.glob("series*.nc"), None)
+        first = next(self.path.glob(f"{kind}*.nc"), None)
         if first is not None:
             self.header = header_in(open_image(first))
 
@@ -86,6 +90,11 @@ def seed_of(folder: Folder | None, rng: Any) -> np.random.SeedSequence:
     """The seed of all series: the one that is given, or that of the folder, or a new one."""
     found = folder.seed if folder is not None and rng is None else None
     return seed_sequence(rng) if found is None else found
+
+
+def in_folder(folder: CheckpointFile, kind: str, k: int) -> PartFile:
+    """The file of one of several."""
+    return PartFile.belonging(folder, Path(folder.path) / f"{kind}{k}.nc")
 
 
 def several(
@@ -129,7 +138,7 @@ def _series_answered(
     for k, problem in enumerate(unit[1], unit[0]):
         seed, options = child(shared["seed"], k), shared["options"]
         if shared["folder"] is not None:
-            options = {**options, "checkpoint": _in_folder(shared["folder"], k)}
+            options = {**options, "checkpoint": in_folder(shared["folder"], "series", k)}
         try:
             answer = shared["answer"](problem, shared["engine"], seed, options)
         except BayesmcError as error:
@@ -138,10 +147,6 @@ def _series_answered(
             raise KeyboardInterrupt
         found.append(answer)
     return found
-
-
-def _in_folder(folder: CheckpointFile, k: int) -> PartFile:
-    return PartFile.belonging(folder, Path(folder.path) / f"series{k}.nc")
 
 
 def _posed(

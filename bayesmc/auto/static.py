@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from typing import Any
 
+import numpy as np
+
 from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.files import Opened
@@ -115,7 +117,7 @@ def infer(
     if opened is None:
         found = chosen.run(problem, seed_sequence(rng), keep, progress, resume, **spread)
     else:
-        found = _run_saved(opened, chosen, rng, keep, progress, spread)
+        found = run_saved(opened, chosen, opened.seed(rng), keep, progress, spread)
     return checked_answer(chosen, found)
 
 
@@ -140,6 +142,31 @@ def checked_answer(engine: Any, found: Any) -> Posterior:
         raise TypeError(
             f"{type(engine).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
         )
+    return found
+
+
+def run_saved(
+    opened: Opened,
+    engine: Any,
+    seed: np.random.SeedSequence,
+    keep: Any,
+    progress: bool | None,
+    spread: Mapping[str, Any],
+) -> Any:
+    """The answer of a run that is saved as it goes on."""
+    if (keep == "file" or isinstance(keep, Mapping)) and not engine.saves:
+        raise UnsupportedError(
+            f"infer(keep={keep!r}): {type(engine).__name__} makes no draws that could stay in a file; leave "
+            "keep= out"
+        )
+    file, answer = opened.begin(engine, seed, keep, {})
+    if file is None:
+        return answer
+    with closing(file):
+        if engine.saves:
+            return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file, **spread)
+        found = engine.run(opened.problem, seed, keep, progress, None, **spread)
+        file.finish(found)
     return found
 
 
@@ -238,32 +265,6 @@ def _opened(checkpoint: Any, problem: Problem, resume: Posterior | None) -> Open
             "(resume=bmc.load(path, net=net) adds draws to a run that has ended)"
         )
     return Opened("infer", checkpoint, problem)
-
-
-def _run_saved(
-    opened: Opened,
-    engine: Any,
-    rng: Any,
-    keep: Any,
-    progress: bool | None,
-    spread: Mapping[str, Any],
-) -> Any:
-    """The answer of a run that is saved as it goes on."""
-    if (keep == "file" or isinstance(keep, Mapping)) and not engine.saves:
-        raise UnsupportedError(
-            f"infer(keep={keep!r}): {type(engine).__name__} makes no draws that could stay in a file; leave "
-            "keep= out"
-        )
-    seed = opened.seed(rng)
-    file, answer = opened.begin(engine, seed, keep, {})
-    if file is None:
-        return answer
-    with closing(file):
-        if engine.saves:
-            return engine.run(opened.problem, seed, keep, progress, None, checkpoint=file, **spread)
-        found = engine.run(opened.problem, seed, keep, progress, None, **spread)
-        file.finish(found)
-    return found
 
 
 def _checked(engine: Any) -> Any:

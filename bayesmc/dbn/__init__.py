@@ -1,9 +1,9 @@
 """Dynamic Bayes nets: a template of one slice, what it compiles to, and data over time."""
 
-from bayesmc.dbn.problem import UNCOMPARED, SeriesProblem, pose_series, undrawn
+from bayesmc.dbn.problem import UNCOMPARED, SeriesProblem, pose_series, undrawn, with_computed
 from bayesmc.dbn.series import Row, Series, read_row
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices
-from bayesmc.dbn.static import given_static, read_static, with_computed
+from bayesmc.dbn.static import given_static, read_static
 from bayesmc.dbn.template import DynamicBayesNet
 
 __all__ = [

@@ -13,11 +13,19 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn.calendar import is_even, uneven_at
+from bayesmc.dbn.calendar import is_even, last_times, uneven_at
 from bayesmc.dbn.given import check_frame
 from bayesmc.dbn.slices import TIME, Template
 from bayesmc.errors import EvidenceError
-from bayesmc.network.columns import clock, columns_of, is_dated, is_frame, is_text
+from bayesmc.network.columns import (
+    clock,
+    columns_of,
+    is_dated,
+    is_frame,
+    is_text,
+    on_the_wall,
+    zone_of,
+)
 from bayesmc.network.frames import names_of, read_table, with_inputs
 from bayesmc.network.labels import is_default, oriented
 
@@ -36,6 +44,33 @@ def unframed_series(
         A column is nothing of the template; rows are not in the order of time, or not at equal steps of it
         (unless an input says how much time passes).
     """
+    observations, inputs, times = _unframed(template, observations, inputs)
+    return observations, inputs, None if times is None else times.wall
+
+
+def times_ahead(
+    template: Template, observations: Any, inputs: Any, count: int, steps: int
+) -> np.ndarray | None:
+    """What labels the last ``steps`` of ``count`` slices, the first of which have rows; None if nobody knows.
+
+    Steps that are shorter than a day are even in time, and labels follow the clock of the data's zone where
+    it is put forward or back; days, weeks and months are those of the calendar.
+    """
+    times = _unframed(template, observations, inputs)[2]
+    if times is None:
+        return None
+    passed = np.diff(times.instants[:2])
+    known = times.zone is not None and len(times.wall) < count and passed.size
+    if not known or passed[0] >= np.timedelta64(1, "D"):
+        return last_times(times.wall, count, steps)
+    ahead = last_times(times.instants, count, steps)
+    return None if ahead is None else on_the_wall(ahead, times.zone).astype(times.wall.dtype)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _unframed(template: Template, observations: Any, inputs: Any) -> tuple[Any, Any, _Times | None]:
     times = None
     _check_indexes(template, observations, inputs)
     if is_frame(observations):
@@ -51,24 +86,22 @@ def unframed_series(
         times = _index_of(template, observations)
     if times is not None:
         _check_even(template, times, inputs if isinstance(inputs, Mapping) else {})
-    return observations, inputs, None if times is None else times.wall
-
-
-# ---- private ------------------------------------------------------------------------------------
+    return observations, inputs, times
 
 
 @dataclass(frozen=True, eq=False)
 class _Times:
     """Times as the clock on the wall shows them, which label slices, and as instants, which are checked.
 
-    Both are the same array where there is no zone.
+    Both are the same array where there is no zone, and ``zone`` is None.
     """
 
     wall: np.ndarray
     instants: np.ndarray
+    zone: Any = None
 
     def take(self, rows: np.ndarray) -> _Times:
-        return _Times(self.wall[rows], self.instants[rows])
+        return _Times(self.wall[rows], self.instants[rows], self.zone)
 
 
 def _read(what: str, template: Template, frame: Any) -> tuple[dict[str, Any], _Times | None]:
@@ -182,7 +215,9 @@ def _times(what: str, name: str | None, labels: Any) -> _Times:
             f"dates like '2024-01-31', so whether rows are in order cannot be told; give "
             f"pd.to_datetime({given}, format=...) or numbers, or {drop}"
         )
-    return _Times(wall, clock(labels, zone=True) if wall.dtype.kind == "M" else wall)
+    if wall.dtype.kind != "M":
+        return _Times(wall, wall)
+    return _Times(wall, clock(labels, zone=True), zone_of(labels))
 
 
 def _index_of(template: Template, observations: Mapping[str, Any]) -> _Times | None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from bayesmc.dbn.series import Series, read_series
 from bayesmc.dbn.slices import Slices
-from bayesmc.dbn.static import with_computed
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.errors import BayesmcError, ModelError
 from bayesmc.network import Model
@@ -86,6 +85,17 @@ class SeriesProblem:
             if model[n].is_stochastic
             and (n not in self.series.static or self.series.static[n].mask is not None)
         )
+
+
+def with_computed(slices: Slices, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Values of static nodes, and of the static nodes that are computed from these alone."""
+    found = dict(values)
+    with np.errstate(all="ignore"):
+        for name, node in slices.first.nodes.items():  # parents stand before their children
+            if name in slices.template.static and name not in found and not node.is_stochastic:
+                if all(p in found for p in node.parents):
+                    found[name] = np.asarray(slices.first.evaluate(name, found)[0])
+    return found
 
 
 def undrawn(slices: Slices) -> frozenset[str]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesmc.dbn.by_chance import lags_by_chance
 from bayesmc.dbn.names import far_back, meant
+from bayesmc.dbn.travelling import Travelling
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
@@ -194,7 +195,7 @@ class Template:
 
 
 @dataclass(frozen=True, eq=False)
-class Slices:
+class Slices(Travelling):
     """A compiled template.
 
     Attributes
@@ -208,11 +209,6 @@ class Slices:
     template: Template
     first: Model
     later: Model
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions."""
-        models = {"first": self.first.without_functions(), "later": self.later.without_functions()}
-        return {**self.__dict__, **models}
 
     def model(self, t: int) -> Model:
         """The model of slice ``t``."""

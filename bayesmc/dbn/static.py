@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.dbn.problem import with_computed
 from bayesmc.dbn.slices import Slices, Template
 from bayesmc.errors import EvidenceError, did_you_mean
 from bayesmc.network.evidence import observe
@@ -31,17 +32,6 @@ def given_static(template: Template, static: Any) -> dict[str, Any]:
                 f"{did_you_mean(name, template.static)}; there are {list(template.static)}"
             )
     return dict(static or {})
-
-
-def with_computed(slices: Slices, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Values of static nodes, and of the static nodes that are computed from these alone."""
-    found = dict(values)
-    with np.errstate(all="ignore"):
-        for name, node in slices.first.nodes.items():  # parents stand before their children
-            if name in slices.template.static and name not in found and not node.is_stochastic:
-                if all(p in found for p in node.parents):
-                    found[name] = np.asarray(slices.first.evaluate(name, found)[0])
-    return found
 
 
 def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -150,9 +150,9 @@ class SliceBelief(OnlineBelief):
         found = self._posterior
         if self.dbn is None:
             raise QueryError(
-                "this belief was unpickled, and pickles carry no functions: it says means, variances, "
-                "probabilities and densities of nodes; for the rest give it the template again, "
-                "engine.start(dbn, belief=belief)"
+                "this belief was loaded or unpickled, and files and pickles carry no functions: it says "
+                "means, variances, probabilities and densities of nodes; for the rest give it the template "
+                "again, engine.start(dbn, belief=belief)"
             )
         return found
 
@@ -202,8 +202,8 @@ def refuse_unbound(engine: Any, belief: Any) -> None:
     if belief.dbn is None:
         who = type(engine).__name__
         raise ModelError(
-            f"{who}().step: this belief was unpickled, and pickles carry no functions; give it the template "
-            "again, belief = engine.start(dbn, belief=belief), and go on"
+            f"{who}().step: this belief was loaded or unpickled, and files and pickles carry no "
+            "functions; give it the template again, belief = engine.start(dbn, belief=belief), and go on"
         )
 
 
@@ -240,6 +240,11 @@ def slices_like(dbn: DynamicBayesNet, belief: Any) -> Slices | None:
     new = dbn.slices(sizes, inputs)
     for a, b, where in ((old.first, new.first, "slice 0"), (old.later, new.later, "later slices")):
         _check_alike(a, b, where)
+    if new.first is not old.first or new.later is not old.later:
+        now = new.prints
+        for what, told in old.prints.items():
+            if now.get(what, told) != told:
+                raise _other(f"{what} is another one")
     return new
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
 from bayesmc.results import Posterior
+from bayesmc.results.over_time import TIMES
 
 #: where a problem keeps the question over time that it was unrolled from
 _SERIES = "series"
@@ -48,7 +49,7 @@ def pose_any(
     """
     if not isinstance(net, DynamicBayesNet):
         return pose(net, evidence, inputs)
-    evidence, inputs, _ = net.unframed(evidence, inputs)
+    evidence, inputs, times = net.unframed(evidence, inputs)
     series = pose_series(net, evidence, inputs)
     was = None if earlier is None else earlier.problem
     if was is not None and _same_template(was, series):
@@ -57,6 +58,8 @@ def pose_any(
         unrolled = net.unroll(series.steps, inputs)
     problem = pose(unrolled, net.unrolled_evidence(evidence or {}))
     problem.cache[_SERIES] = series
+    if times is not None and len(times) == series.steps:
+        problem.model.cache[TIMES] = times
     return problem
 
 

@@ -64,6 +64,8 @@ def calibrate_many(bound: BoundTree, states: np.ndarray) -> Block:
     states : ndarray of int, shape (sets, variables)
         Positions of observed states, in the order of ``tree.variables``; -1 where unobserved.
 
+    Of evidence that is impossible ``log_z`` is -inf, and marginals are NaN.
+
     Notes
     -----
     Hugin propagation (Jensen, Lauritzen and Olesen 1990), as in `BoundTree.calibrate`.
@@ -79,9 +81,13 @@ def calibrate_many(bound: BoundTree, states: np.ndarray) -> Block:
     """
     try:
         with np.errstate(under="raise", over="raise", invalid="raise"):
-            return _Passes(bound, np.ascontiguousarray(states.T)).run()
+            found = _Passes(bound, np.ascontiguousarray(states.T)).run()
     except FloatingPointError:
         return _one_by_one(bound, states)
+    possible = np.isfinite(found.log_z)
+    if possible.any() and not possible.all():  # impossible sets have no marginals; the others have
+        found.marginals[possible] = calibrate_many(bound, states[possible]).marginals
+    return found
 
 
 class OneOfMany(Calibrated):

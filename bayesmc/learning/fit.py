@@ -136,13 +136,7 @@ def fit(
     """
     if not isinstance(net, (BayesNet, DynamicBayesNet)):
         raise ModelError(f"fit: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}")
-    if not isinstance(start, Mapping | None):
-        raise ModelError(
-            f"fit: start= is a {type(start).__name__}; give a dict, node -> value or table -> probabilities"
-        )
-    if max_iterations < 1:
-        raise ModelError(f"fit: max_iterations is {max_iterations}; give 1 or more")
-    _check_restarts(restarts)
+    _check_options(start, max_iterations, restarts)
     start = start or {}
     data, inputs = _as_dicts(net, data, inputs)
     chosen = _chosen(net, data, inputs, learn)
@@ -315,10 +309,16 @@ def _by_elimination(
     return Evidence(unknowns, log_evidence, prior)
 
 
-def _check_restarts(restarts: Any) -> None:
+def _check_options(start: Any, max_iterations: int, restarts: Any) -> None:
+    if not isinstance(start, Mapping | None):
+        raise ModelError(
+            f"fit: start= is a {type(start).__name__}; give a dict, node -> value or table -> probabilities"
+        )
+    if max_iterations < 1:
+        raise ModelError(f"fit: max_iterations is {max_iterations}; give 1 or more")
     whole = isinstance(restarts, (int, np.integer)) and not isinstance(restarts, bool)
     if restarts is not None and not (whole and restarts > 0):
-        raise ValueError(f"fit(restarts={restarts!r}): give a whole number of climbs, 1 or more")
+        raise ModelError(f"fit: restarts is {restarts!r}; give a whole number of climbs, 1 or more")
 
 
 def _starts(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -45,7 +45,7 @@ def fit_tables(
     start: Mapping[str, Any],
     climb: Climb,
 ) -> Fit:
-    """See ``fit``."""
+    """See ``fit``; ``again`` is how often EM begins, and a generator."""
     if isinstance(net, DynamicBayesNet):
         series = SeriesCounts(net, data, inputs, learned)
         begin = {n: _begin(n, t, start) for n, t in series.tables().items()}
@@ -61,13 +61,7 @@ def fit_tables(
         raise EvidenceError(
             "fit: there are no data; give a column for each node, with one entry for each case"
         )
-    for name in data:
-        if name not in model.nodes:
-            raise EvidenceError(
-                f"fit: the data have a column {name!r}, which is no "
-                f"node{did_you_mean(name, model.nodes)}; drop it, or "
-                "rename it"
-            )
+    _check_columns(data, model)
     columns = {n: _codes(model[n], data[n]) for n in names if n in data}
     lengths = {n: len(c) for n, c in columns.items()}
     if len(set(lengths.values())) > 1:
@@ -115,15 +109,16 @@ def _told_of(bar: Progress, expected: Expected) -> Expected:
 
 def _begins(
     begin: Tables, start: Mapping[str, Any], restarts: int, rng: np.random.Generator
-) -> Iterator[Tables]:
+) -> list[Tables]:
     """Tables to begin at: those of the net, then random rows of all that are not given."""
-    yield begin
+    found = [begin]
     for _ in range(restarts - 1):
         drawn = {}
         for name, table in begin.items():
             rows = rng.standard_gamma(1.0, size=table.shape) * (table > 0)
             drawn[name] = table if name in start else rows / rows.sum(axis=-1, keepdims=True)
-        yield drawn
+        found.append(drawn)
+    return found
 
 
 def _highest(
@@ -157,6 +152,16 @@ def _fit(filled: Any, found: Learned, counts: Any, ends: np.ndarray) -> Fit:
         filled, found.tables, found.errors, found.log_likelihood, found.objective, found.history,
         found.converged, len(found.history) - 1, how, climbs=ends,
     )  # fmt: skip
+
+
+def _check_columns(data: Mapping[str, Any], model: Model) -> None:
+    for name in data:
+        if name not in model.nodes:
+            raise EvidenceError(
+                f"fit: the data have a column {name!r}, which is no "
+                f"node{did_you_mean(name, model.nodes)}; drop it, or "
+                "rename it"
+            )
 
 
 def _check_net(net: BayesNet, model: Model, learned: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from numbers import Number
 from typing import Any
 
@@ -147,6 +147,35 @@ def clock(labels: Any, zone: bool = False) -> np.ndarray:
         plain = [_bare(v, zone) for v in array.tolist()]
         return np.array(plain, dtype="datetime64[us]")
     return array
+
+
+def zone_of(labels: Any) -> tzinfo | None:
+    """The zone that labels of time are all in; None where they are in none, or in several."""
+    found = getattr(labels, "tz", None)
+    if found is not None or hasattr(labels, "tz"):
+        return found
+    array = np.asarray(labels)
+    if array.dtype.kind != "O":
+        return None
+    zones = {str(z): z for z in (getattr(v, "tzinfo", None) for v in array.ravel().tolist())}
+    return next(iter(zones.values())) if len(zones) == 1 else None
+
+
+def on_the_wall(instants: np.ndarray, zone: tzinfo) -> np.ndarray:
+    """Instants, by the clock of Greenwich, as clocks in a zone show them.
+
+    Examples
+    --------
+    >>> from datetime import timedelta, timezone
+    >>> import numpy as np
+    >>> from bayesmc.network.columns import on_the_wall
+    >>> instants, zone = np.array(["2024-01-31T23:00"], "M8[m]"), timezone(timedelta(hours=2))
+    >>> on_the_wall(instants, zone).astype(str).tolist()
+    ['2024-02-01T01:00:00.000000']
+    """
+    plain = instants.astype("datetime64[us]").tolist()
+    shown = [v.replace(tzinfo=UTC).astimezone(zone).replace(tzinfo=None) for v in plain]
+    return np.array(shown, dtype="datetime64[us]")
 
 
 def is_text(labels: Any) -> bool:

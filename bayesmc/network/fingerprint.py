@@ -56,6 +56,20 @@ def fingerprint(model: Model) -> Fingerprint:
     return found
 
 
+def lasting_fingerprint(models: Mapping[str, Model]) -> Fingerprint:
+    """What several models say, each by where it stands; empty where functions are gone.
+
+    What cannot be seen of a function is not in it, and no warning says so.
+    """
+    declared = [node.declaration for model in models.values() for node in model.nodes.values()]
+    if any(own.source == "function" and own.function is None for own in declared):
+        return {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CheckpointWarning)
+        each = {where: fingerprint(model) for where, model in models.items()}
+    return {f"{where} {what}": told for where, own in each.items() for what, told in own.items()}
+
+
 def evidence_fingerprint(observed: Mapping[str, Observed], what: str = "evidence") -> Fingerprint:
     """What was seen, node by node."""
     return {

@@ -31,6 +31,9 @@ from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
 
+#: in a model's cache: the same model without functions
+_BARE = "without functions"
+
 
 @dataclass(frozen=True, eq=False)
 class CompiledNode:
@@ -158,11 +161,15 @@ class Model:
 
     def without_functions(self) -> Model:
         """The same model for results that are stored: it describes nodes but evaluates none."""
+        found: Model | None = self.cache.get(_BARE)
+        if found is not None:  # many answers on one model are stored with one
+            return found
         nodes = {
             name: replace(node, declaration=replace(node.declaration, function=None, captured=()))
             for name, node in self.nodes.items()
         }
-        return replace(self, nodes=nodes, potentials={}, probe={}, cache={})
+        found = self.cache[_BARE] = replace(self, nodes=nodes, potentials={}, probe={}, cache={})
+        return found
 
     def evaluate(self, name: str, values: Mapping[str, np.ndarray]) -> tuple[Any, Shape]:
         """What node ``name`` is given its parents' stored values, and the batch shape of those.

@@ -6,7 +6,7 @@ pandas loads only here, when it is asked for.
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -126,6 +126,39 @@ def series_frame(found: Any, names: str | Sequence[str] | None, quantiles: Seque
     levels = frames.MultiIndex.from_tuples(list(columns), names=["node", "element", "statistic"])
     data = np.stack(list(columns.values()), axis=1) if columns else np.zeros((found.steps, 0))
     return frames.DataFrame(data, index=index, columns=levels)
+
+
+def posteriors_frame(found: Any, names: str | Sequence[str] | None) -> Any:
+    """See ``Posteriors.to_dataframe``."""
+    listed = [names] if isinstance(names, str) else names
+    frames = pandas()
+    if found.model is None:
+        if len(found):
+            raise UnsupportedError("to_dataframe: no evidence set was answered")
+        return frames.DataFrame(index=frames.Index([], name="evidence_set"))
+    columns: dict[tuple[str, str, str], np.ndarray] = {}
+    for name in found._free() if listed is None else listed:
+        columns |= {
+            (name, element, kind): values
+            for element, kind, values in posteriors_columns(found, name)
+        }
+    index = frames.RangeIndex(len(found), name="evidence_set")
+    levels = frames.MultiIndex.from_tuples(list(columns), names=["node", "element", "statistic"])
+    data = np.stack(list(columns.values()), axis=1) if columns else np.zeros((len(found), 0))
+    return frames.DataFrame(data, index=index, columns=levels)
+
+
+def posteriors_columns(found: Any, name: str) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Element, statistic and numbers of all evidence sets: probabilities of states, or mean and sd."""
+    node = found._some()._node(name)
+    if node.domain is not None and not node.event_shape:
+        table = found.probabilities(name)
+        parts = {str(s): table[..., k] for k, s in enumerate(node.domain.states)}
+    else:
+        parts = {"mean": found.mean(name), "sd": found.std(name)}
+    flat = {kind: np.reshape(v, (len(found), -1)) for kind, v in parts.items()}
+    for k, element in enumerate(element_names(found.model, node)):
+        yield from ((element, kind, v[:, k]) for kind, v in flat.items())
 
 
 def element_names(model: Model, node: CompiledNode) -> list[str]:

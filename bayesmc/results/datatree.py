@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError, missing_extra
 from bayesmc.network import Model, Observed
-from bayesmc.results.over_time import expanded, slices_of
+from bayesmc.results.over_time import TIMES, expanded, slices_of
 from bayesmc.results.posterior import Posterior
 from bayesmc.states import StateArray
 
@@ -100,8 +100,11 @@ def _dims(model: Model, name: str, rows: Sequence[str]) -> list[str]:
     return own if tuple(rows) == (name,) else ["time", *own]
 
 
-def _coords(model: Model) -> dict[str, list[Any]]:
-    return {p: list(model.labels.get(p, range(n))) for p, n in model.sizes.items()}
+def _coords(model: Model) -> dict[str, Any]:
+    found = {p: list(model.labels.get(p, range(n))) for p, n in model.sizes.items()}
+    if TIMES in model.cache:
+        found["time"] = model.cache[TIMES]
+    return found
 
 
 def _draws_of(drawn: Posterior, group: str, names: Sequence[str], known: str = "") -> Any:

@@ -17,6 +17,8 @@ from bayesmc.errors import QueryError
 from bayesmc.network import Model
 from bayesmc.states import StateArray
 
+#: where a model that was unrolled keeps what the data label its slices with
+TIMES = "times of slices"
 #: methods whose first argument is a node -> the axis that time gets
 STACKED: Mapping[str, int] = {
     "mean": 0, "var": 0, "std": 0, "quantile": 0, "median": 0, "hdi": 0, "mode": 0, "cdf": 0, "mcse": 0,

@@ -358,8 +358,8 @@ class Posterior(Assessed, MarginalAnswers, Framed):
             lost = [n for n, c in self.model.nodes.items() if c.declaration.source == "function"]
             shown = ", ".join(map(repr, lost[:6])) + (", ..." if len(lost) > 6 else "")
             raise UnsupportedError(
-                f"{what}: this posterior was unpickled, and pickles carry no functions; it misses those of "
-                f"the nodes {shown}: {self._reload()}"
+                f"{what}: this posterior was loaded or unpickled, and files and pickles carry no functions; "
+                f"it misses those of the nodes {shown}: {self._reload()}"
             )
         model = self.problem.model
         check_captured(node.declaration for node in model.nodes.values())
@@ -368,7 +368,7 @@ class Posterior(Assessed, MarginalAnswers, Framed):
 
     def _reload(self) -> str:
         """How to have the functions again."""
-        return "declare the net and call infer again, or ask before pickling (bmc.load takes net=)"
+        return "bmc.load(path, net=net) has them again, or declare the net and call infer again"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write it to a file that ``bmc.load`` reads, and ArviZ and xarray, too.

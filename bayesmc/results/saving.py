@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import BayesmcError, CheckpointError
+from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.states import StateArray
 from bayesmc.storage import Group, Lazy, Saver, Variable, packed, write_image
@@ -25,6 +25,8 @@ from bayesmc.storage.image import Stored
 
 #: kinds of files
 ANSWER, RUN = "answer", "run"
+#: along which answers to many questions stand
+_SETS = "evidence_set"
 
 
 def save(
@@ -105,8 +107,6 @@ def _write(
         groups = groups_of(answer, elsewhere, lazily)
         write_image(path, groups, parts, {**attributes, **versions})
     except OSError as error:
-        if isinstance(error, (FileNotFoundError, IsADirectoryError, PermissionError)):
-            raise CheckpointError(f"{path}: {error}") from error
         raise refused(path, error) from error
 
 
@@ -130,6 +130,8 @@ def groups_of(
     model: Model | None = getattr(answer, "model", None)
     if model is None:
         return {}
+    if hasattr(answer, "_each"):
+        return _groups_of_many(answer, model, elsewhere)
     coordinates: dict[str, Any] = {p: model.labels.get(p, range(n)) for p, n in model.sizes.items()}
     groups: dict[str, Group] = {}
     if hasattr(answer, "_stored"):
@@ -149,6 +151,20 @@ def groups_of(
     seen = getattr(answer, "_seen", {})
     if seen:
         groups["observed_data"] = Group(observed_variables(model, seen), coordinates)
+    return groups
+
+
+def _groups_of_many(answer: Any, model: Model, elsewhere: Mapping[int, str]) -> dict[str, Group]:
+    """Answers of all evidence sets side by side, and the groups of each, below a group of its own."""
+    coordinates: dict[str, Any] = {p: model.labels.get(p, range(n)) for p, n in model.sizes.items()}
+    groups: dict[str, Group] = {}
+    found = _answers(answer, model) if answer.done.any() else {}
+    if found:
+        found["log_marginal_likelihood"] = Variable((_SETS,), answer.log_marginal_likelihood)
+        groups["answers"] = Group(found, {_SETS: range(len(answer)), **coordinates})
+    for k, one in answer._each():
+        own = {n: g for n, g in groups_of(one, elsewhere).items() if n != "answers"}
+        groups |= {f"set{k}/{name}": group for name, group in own.items()}
     return groups
 
 
@@ -196,6 +212,9 @@ def _draws(
 def _elsewhere(answer: Any, lazily: Mapping[str, Any] | None) -> dict[int, str]:
     """Arrays that stand where ArviZ looks for draws, and are not packed besides."""
     found: dict[int, str] = {}
+    if hasattr(answer, "_each"):
+        for k, one in answer._each():
+            found |= {at: f"set{k}/{name}" for at, name in _elsewhere(one, None).items()}
     if not hasattr(answer, "_stored"):
         return found
     weighted = answer.log_weights is not None
@@ -245,11 +264,11 @@ def _answers(answer: Any, model: Model) -> dict[str, Variable]:
                 continue
             try:
                 value = np.asarray(ask(name), dtype=float)
-            except BayesmcError:
+            except (BayesmcError, ValueError):
                 continue
             dims = (*_dims(node), *more)
             if value.ndim == len(dims) + 1:
-                dims = ("time", *dims)
+                dims = (_SETS if hasattr(answer, "_each") else "time", *dims)
             if value.ndim == len(dims):
                 found[f"{name}_{what}"] = Variable(dims, value)
     increments = getattr(answer, "log_marginal_increments", None)

@@ -10,10 +10,12 @@ import numpy as np
 
 from bayesmc.drawing.html import band, figure, table
 from bayesmc.errors import BayesmcError
-from bayesmc.results.dataframes import element_names, series_frame
+from bayesmc.results.dataframes import element_names, posteriors_columns, series_frame
 
 #: lines of beliefs that are shown
 _LINES = 24
+#: numbers of each evidence set that are shown
+_COLUMNS = 8
 
 
 class ShownSeries:
@@ -51,6 +53,46 @@ def posterior_html(posterior: Any) -> str:
     except BayesmcError as error:
         inside = f"<div>{escape(str(error))}</div>"
     return f"<div><div><b>{escape(said)}</b></div>{inside}</div>"
+
+
+def posteriors_html(found: Any) -> str:
+    """A line for each evidence set: its log evidence, and the first numbers; of many sets some."""
+    count = len(found)
+    half = _LINES // 2
+    chosen = list(range(count))
+    if count > _LINES:
+        chosen = [*range(half), *range(count - half, count)]
+    head = ["evidence set", "log evidence"]
+    columns: list[np.ndarray] = []
+    ones = [found[k] for k in chosen]
+    some = next((one for one in ones if one is not None), None)
+    shown = type(found).of(ones) if some is not None else None
+    left = 0
+    for name in [] if shown is None else shown._free():
+        try:
+            numbers = list(posteriors_columns(shown, name))
+        except (BayesmcError, ValueError):  # plates of other sizes in some sets, nothing to tell
+            continue
+        for element, kind, values in numbers:
+            if len(columns) >= _COLUMNS:
+                left += 1
+                continue
+            own = f"{name}[{element}]" if element else name
+            head.append(f"P({own}={kind})" if kind not in ("mean", "sd") else f"{own}, {kind}")
+            columns.append(values)
+    rows = []
+    for j, (k, one) in enumerate(zip(chosen, ones, strict=True)):
+        if one is None:
+            why = "impossible" if k in found.impossible else "not answered"
+            rows.append([str(k), why, *[""] * len(columns)])
+            continue
+        log = one.log_marginal_likelihood
+        told = "" if log is None else figure(float(log))
+        rows.append([str(k), told, *(figure(float(v[j])) for v in columns)])
+    if count > _LINES:
+        rows.insert(half, [f"... {count - _LINES} more ...", *[""] * (len(head) - 1)])
+    more = f"<div>... and {left} more columns</div>" if left else ""
+    return f"<div><div><b>{escape(repr(found))}</b></div>{table(head, rows)}{more}</div>"
 
 
 def series_html(found: Any) -> str:

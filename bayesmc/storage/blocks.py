@@ -8,6 +8,7 @@ checksums.
 
 from __future__ import annotations
 
+import errno
 import os
 import struct
 import zlib
@@ -241,7 +242,20 @@ class Lock:
 
 
 def refused(path: Path, error: OSError) -> CheckpointError:
-    """What is said of a disk that takes no more."""
+    """What is said of a path that cannot be written, or of a disk that takes no more."""
+    if path.is_dir():
+        return CheckpointError(
+            f"{path}: that is a folder; give the path of a file, such as {str(path / 'run.nc')!r}"
+        )
+    if not path.parent.is_dir():
+        return CheckpointError(
+            f"{path}: there is no folder {path.parent}; make it, or give another path"
+        )
+    if isinstance(error, (PermissionError, FileNotFoundError)) or error.errno == errno.EROFS:
+        return CheckpointError(
+            f"{path}: it may not be written ({error.strerror or error}); give a path in a folder where you "
+            "may write"
+        )
     return CheckpointError(
         f"{path}: {error.strerror or error}; what was saved before is whole, and the same call goes on from "
         "there once there is room"

@@ -6,10 +6,13 @@ along (cloudpickle). What both sides have already, the posed problem above all, 
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.errors import UnsupportedError, WorkerError, missing_extra
@@ -58,15 +61,46 @@ def unpacked(data: bytes, known: Mapping[str, Any] | None = None) -> Any:
     return reader.load()
 
 
-def pack_job(function: Any, shared: Mapping[str, Any]) -> bytes:
+class Job(NamedTuple):
+    """A function with what all its units share, in parts that workers keep by their digests.
+
+    Attributes
+    ----------
+    parts : dict of bytes
+        Digest -> what it is of: compiled nets first, which outlive the question, then the question itself.
+    seeds : dict
+        Random seeds among what is shared; they go along with each unit, so that the question asked again
+        with another seed is the same job.
+    """
+
+    parts: Mapping[str, bytes]
+    seeds: Mapping[str, np.random.SeedSequence]
+
+    @property
+    def digests(self) -> tuple[str, ...]:
+        """Of the parts; the last one is of the question, and tells that all are the same."""
+        return tuple(self.parts)
+
+
+def pack_job(function: Any, shared: Mapping[str, Any]) -> Job:
     """A function with what all its units share, or an error that names what does not travel.
 
     Raises
     ------
     WorkerError
     """
+    seeds = {n: v for n, v in shared.items() if isinstance(v, np.random.SeedSequence)}
+    lasting = {n: v for n, v in shared.items() if n not in seeds}
+    parts: dict[str, bytes] = {}
+    known: dict[str, Any] = {}
     try:
-        return packed((function, dict(shared)))
+        for compiled in _compiled(lasting):
+            data = packed(compiled)
+            digest = hashlib.sha256(data).hexdigest()
+            parts[digest] = data
+            known |= named(digest, compiled)
+        data = packed((function, lasting), known)
+        parts[hashlib.sha256(data).hexdigest()] = data
     except Exception as error:
         culprit = next(_culprits(shared), None)
         told = f"{culprit}, which does not travel" if culprit else "the question does not travel"
@@ -74,6 +108,12 @@ def pack_job(function: Any, shared: Mapping[str, Any]) -> bytes:
             f"executor=: {told} to another process ({type(error).__name__}: {error}); make it inside the "
             "function or hand in its numbers, or give a ThreadPoolExecutor, whose workers share memory"
         ) from error
+    return Job(parts, seeds)
+
+
+def named(digest: str, compiled: tuple[Any, ...]) -> dict[str, Any]:
+    """The names under which a job speaks of a part with a compiled net."""
+    return {f"{digest} {k}": one for k, one in enumerate(compiled)}
 
 
 def known_to(shared: Mapping[str, Any], unit: Any = None) -> dict[str, Any]:
@@ -92,6 +132,15 @@ def known_to(shared: Mapping[str, Any], unit: Any = None) -> dict[str, Any]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _compiled(shared: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    """What of a question was there before it was asked: compiled nets, with what they were declared as."""
+    for value in shared.values():
+        if isinstance(value, Problem):
+            yield value.model, value.net
+        elif isinstance(value, SeriesProblem):
+            yield value.slices, value.slices.first, value.slices.later, value.dbn
 
 
 def _items(shared: Mapping[str, Any], unit: Any) -> Iterator[tuple[str, Any]]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import concurrent.futures
-import hashlib
 import os
 import sys
 import warnings
@@ -23,7 +22,7 @@ from typing import Any, NamedTuple
 from bayesmc.errors import InterruptWarning, WorkerError, WorkerWarning
 from bayesmc.progress import Progress
 from bayesmc.workers.remote import Told, work
-from bayesmc.workers.travel import known_to, pack_job, packed, unpacked
+from bayesmc.workers.travel import Job, known_to, pack_job, packed, unpacked
 
 #: bytes up to which a job is sent along with every unit; larger ones go to workers that ask
 _SMALL = 1 << 16
@@ -195,8 +194,8 @@ class _Crew:
         self.function, self.shared, self.executor = function, shared, executor
         self.own = False  # whether the executor is a successor, to be shut down here
         self.here = isinstance(executor, ThreadPoolExecutor) and not _is_interpreters(executor)
-        self.data = b"" if self.here else pack_job(function, shared)
-        self.job = hashlib.sha256(self.data).hexdigest()
+        self.job = Job({}, {}) if self.here else pack_job(function, shared)
+        self.lasting = {n: v for n, v in shared.items() if n not in self.job.seeds}
         self.limit = _AHEAD * workers_of(executor)
         self.waiting: dict[Future[Any], tuple[int, Any]] = {}
         self.lost: dict[int, int] = {}
@@ -224,26 +223,27 @@ class _Crew:
             if self.own:
                 self.executor.shutdown(wait=False, cancel_futures=True)
 
-    def submit(self, number: int, unit: Any, send: bool = False) -> None:
-        """Hand out a unit; a large job goes along only where a worker has asked for it."""
+    def submit(self, number: int, unit: Any, wanted: Sequence[str] = ()) -> None:
+        """Hand out a unit; a large part of the job goes along only where a worker has asked for it."""
         if self.here:
             own = copy_context()  # errstate and the like are this thread's
             future = self.executor.submit(own.run, self.function, self.shared, unit)
         else:
             try:
-                sent = packed(unit, known_to(self.shared))
+                own_data = packed((unit, self.job.seeds), known_to(self.lasting))
             except Exception as error:
                 raise WorkerError(
                     f"executor=: unit {number} does not travel to another process "
                     f"({type(error).__name__}: {error}); give a ThreadPoolExecutor, or leave executor= out"
                 ) from error
-            data = self.data if send or len(self.data) <= _SMALL else None
-            attempt = self.lost.get(number, 0)
+            parts = self.job.parts.items()
+            sent = {d: data for d, data in parts if d in wanted or len(data) <= _SMALL}
+            given = self.job.digests, sent, own_data, self.lost.get(number, 0)
             try:
-                future = self.executor.submit(work, self.job, data, sent, attempt)
+                future = self.executor.submit(work, *given)
             except BrokenExecutor as error:
                 self.replace(error)
-                future = self.executor.submit(work, self.job, data, sent, attempt)
+                future = self.executor.submit(work, *given)
         self.waiting[future] = number, unit
 
     def back(self) -> Iterator[tuple[int, Any]]:
@@ -271,7 +271,7 @@ class _Crew:
                 yield number, found
                 continue
             if found.kind == "wanted":
-                self.submit(number, unit, send=True)
+                self.submit(number, unit, found.wanted)
                 continue
             self.breaks = 0
             yield number, self.opened(found, unit, number)

@@ -21,7 +21,7 @@ from bayesmc.errors import (
     FileFormatError,
     UnsupportedError,
 )
-from bayesmc.storage import Saver
+from bayesmc.storage import Blocks, Saver
 from tests import kills
 from tests.workers.test_units import Elsewhere
 
@@ -344,3 +344,39 @@ def test_a_posterior_that_was_saved_is_no_run(tmp_path: Path) -> None:
         bmc.infer(net(), {"y": Y}, checkpoint=path)
     with pytest.raises(ValueError, match="seconds, 0 or more"):
         bmc.CheckpointFile(path, every=-1)
+
+
+def test_a_smoothed_series_is_kept(tmp_path: Path) -> None:
+    dbn, seen = kills.walk(False, 12)
+    engine = bmc.ParticleFilter(60)
+    wanted = bmc.smooth(dbn, seen, engine=engine, rng=1).mean("x")
+    path = tmp_path / "smooth.nc"
+    first = bmc.smooth(dbn, seen, engine=engine, rng=1, checkpoint=path)
+    with pytest.MonkeyPatch.context() as patch:  # the second call reads
+        patch.setattr(bmc.ParticleFilter, "smooth", None)
+        again = bmc.smooth(dbn, seen, checkpoint=path)
+    assert np.array_equal(first.mean("x"), wanted) and np.array_equal(again.mean("x"), wanted)
+    with pytest.raises(CheckpointError, match="lag= was None and is 2 now"):
+        bmc.smooth(dbn, seen, engine=engine, rng=1, lag=2, checkpoint=path)
+    with pytest.raises(CheckpointError, match="belongs to a call of smooth"):
+        bmc.filter(dbn, seen, engine=engine, rng=1, checkpoint=path)
+    several = [seen, {"y": seen["y"][:5]}]
+    answers = bmc.smooth(dbn, several, engine=engine, rng=1, checkpoint=tmp_path / "all")
+    alone = bmc.smooth(dbn, several, engine=engine, rng=1)
+    assert all(
+        np.array_equal(a.mean("x"), b.mean("x")) for a, b in zip(answers, alone, strict=True)
+    )
+    assert sorted(p.name for p in (tmp_path / "all").iterdir()) == ["series0.nc", "series1.nc"]
+
+
+def test_islands_of_workers_go_on_anywhere(tmp_path: Path) -> None:
+    """Begun by threads, and gone on with here, where particles lie in no shared memory."""
+    dbn, seen = kills.walk(False, 100)
+    engine = bmc.IslandFilter(bmc.ParticleFilter(60, compiled=False), islands=3, threshold=0.99)
+    wanted = kills.bits(bmc.filter(dbn, seen, engine=engine, rng=2))
+    file = bmc.CheckpointFile(tmp_path / "islands.nc", every=0)
+    with ThreadPoolExecutor(2) as threads, stopped_after(4), pytest.raises(Stopped):
+        bmc.filter(dbn, seen, engine=engine, rng=2, checkpoint=file, executor=threads)
+    assert Blocks(tmp_path / "islands.nc").count == 4
+    found = bmc.filter(dbn, seen, engine=engine, checkpoint=file)
+    assert kills.bits(found) == wanted and len(found.exchanged)

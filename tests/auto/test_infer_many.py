@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,15 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.engines.exact.many import TablePosteriors
-from bayesmc.errors import EvidenceError, InterruptWarning, ShapeError, ZeroProbabilityError
+from bayesmc.errors import (
+    CheckpointError,
+    EvidenceError,
+    EvidenceWarning,
+    InterruptWarning,
+    ShapeError,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.factors import CliqueTree
 from bayesmc.factors import many as blocks
 from bayesmc.testing import random_evidence, random_net
@@ -214,3 +223,141 @@ def test_one_net_is_used_by_many_threads_at_once() -> None:
         finally:
             sys.setswitchinterval(often)
         assert together == [ask(k) for k in range(16)]
+
+
+def bounded() -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("u", bmc.Uniform(0.0, 1.0))
+    net.add("x", lambda m: bmc.Normal(m, 1.0), plates="i")
+    net.add("w", lambda u: bmc.Uniform(u, u + 1.0))
+    return net
+
+
+SOME = [{"x": [1.0, 2.0, 3.0], "w": 0.5}, {"x": [1.0, np.nan, 3.0], "w": 5.0}, {"w": 1.5}]
+
+
+def test_impossible_sets_are_nan_and_the_others_as_without_them() -> None:
+    """A block of sets, and questions one by one."""
+    net = bmc.BayesNet()
+    net.table("a", [], [1.0, 0.0])
+    net.table("b", ["a"], [[0.5, 0.5], [0.1, 0.9]])
+    sets = [{"b": 1}, {"a": 1}, {}, {"a": 1, "b": 0}]
+    with pytest.raises(ZeroProbabilityError, match="set 1: .*so is that of set 3; on_impossible"):
+        bmc.infer_many(net, sets)
+    with pytest.warns(EvidenceWarning, match="no posterior of sets 1, 3"):
+        found = bmc.infer_many(net, sets, on_impossible="nan")
+    assert found.done.tolist() == [True, False, True, False] and [*found.impossible] == [1, 3]
+    assert found[1] is None and found.log_marginal_likelihood[1] == -np.inf
+    assert np.isnan(found.probabilities("a", "b")[1]).all() and np.isnan(found.mean("b")[3])
+    alone = bmc.infer_many(net, [sets[0], sets[2]])
+    np.testing.assert_array_equal(found.probabilities("b")[[0, 2]], alone.probabilities("b"))
+    assert np.isnan(found[1:3].mean("b")).tolist() == [True, False]
+    engine = bmc.LikelihoodWeighting(300)
+    with pytest.warns(EvidenceWarning, match="set 1: .*none of 300 draws"):
+        found = bmc.infer_many(bounded(), SOME, engine=engine, rng=0, on_impossible="nan")
+    assert np.isnan(found.mean("x")).any(axis=1).tolist() == [False, True, False]
+    assert np.isnan(found.log_marginal_likelihood).tolist() == [False, True, False]
+    with pytest.raises(ZeroProbabilityError, match="evidence set 1: "):
+        bmc.infer_many(bounded(), SOME, engine=engine, rng=0)
+    with pytest.raises(ValueError, match='give "raise", or "nan"'):
+        bmc.infer_many(net, sets, on_impossible="skip")
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.EvidenceWarning")
+@pytest.mark.parametrize("kind", ["tables", "draws", "exact"])
+def test_answers_are_saved_and_loaded_with_the_same_bits(kind: str, tmp_path: Path) -> None:
+    pytest.importorskip("h5netcdf", reason="needs the extra netcdf")
+    name, net, make = "rain", chain(), chain
+    if kind == "tables":
+        found = bmc.infer_many(net, [{"slip": "yes"}, {"rain": "no"}, {}])
+    elif kind == "draws":
+        name, net, make = "x", bounded(), bounded
+        engine = bmc.LikelihoodWeighting(200)
+        found = bmc.infer_many(net, SOME, engine=engine, rng=0, on_impossible="nan")
+    else:
+        name, make = "a", normal
+        net = normal()
+        found = bmc.infer_many(net, [{"b": 1.0}, {}])
+    found.save(tmp_path / "many.nc")
+    loaded = bmc.load(tmp_path / "many.nc")
+    ask = loaded.probabilities if kind == "tables" else loaded.mean
+    wanted = found.probabilities(name) if kind == "tables" else found.mean(name)
+    np.testing.assert_array_equal(ask(name), wanted)
+    logs = loaded.log_marginal_likelihood, found.log_marginal_likelihood
+    assert np.array_equal(*logs, equal_nan=True)
+    assert loaded.impossible == found.impossible and type(loaded) is type(found)
+    if kind == "draws":
+        np.testing.assert_array_equal(loaded[2]["m"], found[2]["m"])
+    with pytest.raises(UnsupportedError, match=r"bmc\.load\(path, net=net\)"):
+        loaded[0].predict(name, rng=0)
+    whole = bmc.load(tmp_path / "many.nc", net=make())
+    drawn = [np.asarray(one[0].predict(name, rng=0)[name] == 1.0) for one in (whole, found)]
+    np.testing.assert_array_equal(*drawn)
+    with pytest.raises(CheckpointError, match="about another net"):
+        bmc.load(tmp_path / "many.nc", net=normal(2.0))
+
+
+def normal(scale: float = 1.0) -> bmc.BayesNet:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("b", lambda a: bmc.Normal(a, scale))
+    return net
+
+
+def test_xarray_reads_answers_side_by_side(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray", reason="needs the extra arviz")
+    engine = bmc.LikelihoodWeighting(50)
+    found = bmc.infer_many(normal(), [{"b": 1.0}, {"b": 2.0}], engine=engine, rng=0)
+    found.save(tmp_path / "many.nc")
+    with xarray.open_datatree(tmp_path / "many.nc") as tree:
+        assert tree["answers"]["a_mean"].dims == ("evidence_set",)
+        np.testing.assert_array_equal(tree["answers"]["a_mean"], found.mean("a"))
+        draws = tree["set1"]["weighted_posterior"]["a"]
+        np.testing.assert_array_equal(draws, found[1]["a"])
+
+
+def test_answers_as_a_table_and_in_a_notebook() -> None:
+    pytest.importorskip("pandas", reason="needs the extra pandas")
+    found = bmc.infer_many(chain(), [{"slip": "yes"}, {"slip": "no", "rain": "no"}])
+    frame = found.to_dataframe()
+    assert list(frame.columns.get_level_values("node").unique()) == ["rain", "wet"]
+    np.testing.assert_array_equal(frame["rain", "", "yes"], found.probabilities("rain")[:, 1])
+    assert frame.index.name == "evidence_set" and len(found.to_dataframe("slip").columns) == 2
+    shown = found._repr_html_()
+    assert "P(wet=yes)" in shown and shown.count("<tr>") == 3
+    many = bmc.infer_many(normal(), [{"b": float(k)} for k in range(40)])
+    assert many.to_dataframe()["a", "", "mean"].tolist() == many.mean("a").tolist()
+    assert "16 more" in many._repr_html_() and "a, sd" in many._repr_html_()
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.EvidenceWarning")
+def test_questions_that_are_done_are_kept_in_a_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("h5netcdf", reason="needs the extra netcdf")
+    engine, options = bmc.LikelihoodWeighting(200), {"on_impossible": "nan"}
+    wanted = bmc.infer_many(bounded(), SOME, engine=engine, rng=3, **options).mean("m")
+    run, calls = bmc.LikelihoodWeighting.run, []
+
+    def stopped(*arguments: Any, **more: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 3:
+            raise RuntimeError("the process ends")
+        return run(*arguments, **more)
+
+    def ask(**more: Any) -> Any:
+        return bmc.infer_many(
+            bounded(), SOME, engine=engine, checkpoint=tmp_path, **options, **more
+        )
+
+    monkeypatch.setattr(bmc.LikelihoodWeighting, "run", stopped)
+    with pytest.raises(RuntimeError):
+        ask(rng=3)
+    found = ask()  # of the same seed; the first set is not asked again
+    np.testing.assert_array_equal(found.mean("m"), wanted)
+    assert len(calls) == 5
+    with pytest.raises(CheckpointError, match="set 0: .*the seed .* was 3.* and is 4"):
+        ask(rng=4)
+    with pytest.raises(UnsupportedError, match=r"posteriors\.save\(path\)"):
+        bmc.infer_many(chain(), [{"wet": "yes"}], checkpoint=tmp_path)

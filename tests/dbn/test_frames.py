@@ -189,3 +189,44 @@ def test_zones_label_by_the_wall_and_compare_as_instants(count: int) -> None:
     numbered = rows.reset_index(drop=True)
     with pytest.raises(EvidenceError, match="labelled unlike along 'time'"):
         bmc.filter(dbn, numbered, inputs={"u": numbered["y"].iloc[::-1]})
+
+
+@pytest.mark.parametrize(
+    "first, count, freq, wanted",
+    [
+        ("2024-03-30 22:00", 3, "h", ["2024-03-31T01", "2024-03-31T03", "2024-03-31T04"]),
+        ("2024-03-31 00:00", 4, "h", ["2024-03-31T05", "2024-03-31T06", "2024-03-31T07"]),
+        ("2024-10-27 00:00", 3, "h", ["2024-10-27T02", "2024-10-27T03", "2024-10-27T04"]),
+        ("2024-03-29", 2, "D", ["2024-03-31T00", "2024-04-01T00", "2024-04-02T00"]),
+        ("2024-03-29", 5, "D", ["2024-04-03T00", "2024-04-04T00", "2024-04-05T00"]),
+    ],
+)
+def test_forecasts_are_labelled_by_the_wall_across_a_change_of_the_clock(
+    first, count, freq, wanted
+):
+    """Hours are even in time, and days of the calendar."""
+    index = pd.date_range(first, periods=count, freq=freq, tz="Europe/Berlin")
+    rows = pd.DataFrame({"y": np.zeros(count)}, index=index)
+    named = rows.rename_axis("time").reset_index()
+    for frame in (rows, named):
+        found = bmc.forecast(level(), frame, steps=3)
+        np.testing.assert_array_equal(found.times, np.array(wanted, dtype="datetime64[h]"))
+    ahead = pd.date_range(index[-1], periods=4, freq=freq)[1:].tz_localize(None)
+    np.testing.assert_array_equal(found.times, ahead.to_numpy())  # pandas' own
+
+
+def test_trees_have_the_dates_of_the_data() -> None:
+    pytest.importorskip("arviz_base")
+    pytest.importorskip("xarray")
+    rows = pd.DataFrame({"y": [0.0, np.nan, 1.0, 2.0]}, index=DAYS)
+    engine = bmc.LikelihoodWeighting(500)
+    found = bmc.infer(level(), rows, engine=engine, rng=0).resample(50, rng=0)
+    tree = found.to_datatree(log_likelihood=True)
+    for group, name in (("posterior", "x"), ("observed_data", "y")):
+        np.testing.assert_array_equal(tree[group][name].coords["time"], DAYS.to_numpy())
+    told = tree["log_likelihood"]["y"]
+    np.testing.assert_array_equal(told.coords["y_observed"], DAYS.to_numpy()[[0, 2, 3]])
+    plain = bmc.infer(level(), {"y": rows["y"].to_numpy()}, engine=engine, rng=0).resample(
+        50, rng=0
+    )
+    np.testing.assert_array_equal(plain.to_datatree()["posterior"]["x"].coords["time"], range(4))

@@ -5,11 +5,14 @@ Comparisons that chance has a part in have a false-alarm rate of 1e-3 or less, a
 
 from __future__ import annotations
 
+import itertools
 import pickle
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import multivariate_normal
 
 import bayesmc as bmc
 from bayesmc.engines.marginal.elements.filter import ElementStep
@@ -291,3 +294,37 @@ def test_pools_hold_what_was_put_whatever_was_resampled() -> None:
             for one, other in zip(pool.at(stays), before.at(stays), strict=True):
                 np.testing.assert_array_equal(one, other)
         assert len(pool.generations) < 8
+
+
+def test_elements_where_all_that_is_sampled_is_finite() -> None:
+    """Unbiased against all paths enumerated; no scouts go out for elements (4 standard errors: 6e-5)."""
+    turn = np.array([[0.98, 0.01, 0.01], [0.01, 0.98, 0.01], [0.01, 0.01, 0.98]])
+    dbn = bmc.DynamicBayesNet(plates={"m": 3})
+    dbn.add(
+        "at",
+        lambda at_prev: bmc.Categorical(turn[at_prev]),
+        initial=bmc.Categorical([1 / 3] * 3),
+    )
+    dbn.add(
+        "level",
+        lambda level_prev: bmc.Normal(level_prev, 0.0),
+        plates="m",
+        initial=bmc.Normal(0.0, 2.0),
+    )
+    dbn.add("y", lambda level, at: bmc.Normal(level[at], 0.8))
+    y = np.array([1.1, 0.9, -2.1, -1.8, 1.2])
+    exact = -np.inf
+    for path in itertools.product(range(3), repeat=len(y)):
+        prior = np.log(turn[path[:-1], path[1:]]).sum() - np.log(3)
+        same = np.equal.outer(path, path)
+        cov = 4.0 * same + 0.64 * np.eye(len(y))
+        exact = np.logaddexp(exact, prior + multivariate_normal(np.zeros(len(y)), cov).logpdf(y))
+    engine = bmc.ParticleFilter(40, marginalize="level")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = [
+            bmc.filter(dbn, {"y": y}, engine=engine, rng=k).log_marginal_likelihood
+            for k in range(50)
+        ]
+    ratio = np.exp(np.array(found) - exact)
+    assert abs(ratio.mean() - 1) < 4 * ratio.std() / np.sqrt(len(ratio))

@@ -226,7 +226,7 @@ def test_climbs_that_disagree_are_counted_and_told() -> None:
     alone = bmc.fit(net, {"y": y}, start={"m": -8.0})
     assert len(alone.climbs) == 1 and alone.objective == pytest.approx(lone.climbs[1], abs=1e-3)
     for wrong in (0, 2.5, True):
-        with pytest.raises(ValueError, match="restarts=.*whole number of climbs"):
+        with pytest.raises(ModelError, match="restarts is .*whole number of climbs"):
             bmc.fit(net, {"y": y}, restarts=wrong)
 
 

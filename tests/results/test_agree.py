@@ -232,7 +232,7 @@ def test_pickled_posteriors_still_take_queries(answers, kind):
     np.testing.assert_allclose(by_element, p.expectation(lambda g, level: g * level, plates="p"))
     assert twin.probability(lambda rain: rain == "yes") == pytest.approx(p.probabilities("rain")[1])
     if kind == "exact":  # a sum over a plate is no table, and needs its function
-        with pytest.raises(UnsupportedError, match="was unpickled.*call infer again"):
+        with pytest.raises(UnsupportedError, match="loaded or unpickled.*call infer again"):
             twin.expectation(lambda total: total)
 
 

@@ -464,7 +464,7 @@ def test_pickles_carry_no_functions_and_answer_the_same(weighted):
     assert twin.expectation(lambda m: m.max(axis=-1)) == p.expectation(lambda m: m.max(axis=-1))
     assert twin.weight_ess == p.weight_ess
     with pytest.raises(
-        UnsupportedError, match="predict: this posterior was unpickled.*call infer again"
+        UnsupportedError, match="predict: this posterior was loaded or unpickled.*call infer again"
     ):
         twin.predict("x")
 

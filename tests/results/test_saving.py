@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import BayesmcError, CheckpointError, UnsupportedError
+from bayesmc.errors import BayesmcError, CheckpointError, ModelError, UnsupportedError
 
 pytest.importorskip("h5netcdf", reason="needs the extra netcdf")
 
@@ -159,3 +160,42 @@ def test_over_time(make: Callable[[], Any], engine: Any, tmp_path: Path) -> None
     assert str(answers(loaded)) == str(answers(belief))
     later = engine.step(engine.start(make(), belief=loaded), {"wet": rows[3]})
     assert str(answers(later)) == str(answers(engine.step(belief, {"wet": rows[3]})))
+
+
+def test_a_belief_goes_on_with_its_own_template_alone(tmp_path: Path) -> None:
+    """Saved, pickled or at hand; declared anew by the same lines it is the same."""
+
+    def level(scale: float, table: float = 0.9) -> bmc.DynamicBayesNet:
+        dbn = bmc.DynamicBayesNet()
+        dbn.table("s", ["s_prev"], [[table, 1 - table], [0.2, 0.8]], initial=[0.5, 0.5])
+        dbn.add("x", lambda x_prev: bmc.Normal(x_prev, scale), initial=bmc.Normal(0.0, 1.0))
+        dbn.add("y", lambda x, s: bmc.Normal(x + s, 0.5))
+        return dbn
+
+    engine = bmc.ParticleFilter(50)
+    belief = engine.step(engine.start(level(1.0), rng=0), {"y": 0.3})
+    belief.save(tmp_path / "belief.nc")
+    kept = [bmc.load(tmp_path / "belief.nc"), pickle.loads(pickle.dumps(belief)), belief]
+    kept.append(pickle.loads(pickle.dumps(kept[0])))  # on its way twice
+    wanted = engine.step(belief, {"y": 1.0}).mean("x")
+    for one in kept:
+        again = engine.start(level(1.0), belief=one)
+        assert engine.step(again, {"y": 1.0}).mean("x") == wanted
+        for other, what in (
+            (level(2.0), "the density of node 'x' is another one"),
+            (level(1.0, 0.7), "the table of 's'"),
+        ):
+            with pytest.raises(ModelError, match=f"in later slices {what}"):
+                engine.start(other, belief=one)
+
+
+def test_paths_that_cannot_be_written_are_told_apart(tmp_path: Path) -> None:
+    found = bmc.infer(net_of(), SEEN, engine=bmc.Exact())
+    for path, words in (
+        (tmp_path / "none" / "a.nc", "there is no folder .*none; make it"),
+        (tmp_path, "that is a folder; give the path of a file"),
+    ):
+        with pytest.raises(CheckpointError, match=words):
+            found.save(path)
+    with pytest.raises(CheckpointError, match="there is no folder .*none; make it"):
+        bmc.infer(net_of(), SEEN, engine=bmc.Exact(), checkpoint=tmp_path / "none" / "a.nc")

@@ -18,6 +18,10 @@ def doubled(shared: Mapping[str, Any], unit: int) -> int:
     return int(shared["factor"]) * unit
 
 
+def scaled(shared: Mapping[str, Any], unit: int) -> Any:
+    return shared["factor"] * unit
+
+
 def late(shared: Mapping[str, Any], unit: int) -> int:
     time.sleep(0.05 if unit == 0 else 0.0)
     return unit

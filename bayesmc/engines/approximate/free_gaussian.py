@@ -164,7 +164,7 @@ class FreeGaussian:
         """Draws in standard coordinates, with their log density there, as draws of nodes."""
         if self.density is None:
             raise UnsupportedError(
-                "this approximation was unpickled, and pickles carry no functions"
+                "this approximation was loaded or unpickled, and files and pickles carry no functions"
             )
         away = scipy.linalg.solve_triangular(self.root, z.T, lower=True, trans="T").T
         u = self.center + away

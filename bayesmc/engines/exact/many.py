@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +15,7 @@ from bayesmc.engines.exact.hybrid_plan import DiscretePlan, Solved, plan_for
 from bayesmc.factors import BoundTree
 from bayesmc.factors.many import OneOfMany, block_size, calibrate_many, is_worth_it
 from bayesmc.network import Observed, Problem
+from bayesmc.network.fingerprint import fingerprint
 from bayesmc.results.many import Posteriors
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.statistics import table_variance
@@ -36,13 +38,13 @@ class Prepared:
         self.problem, self.engine = problem, engine
         plan = plan_for(problem)
         assert isinstance(plan, DiscretePlan)
-        self.plan = plan
+        self.net, self.tree = plan.net, plan.tree
         self.bound: BoundTree = plan._bound(problem)[0]
         self._codes: dict[str, tuple[int, dict[Any, int]]] = {}
         for name, node in problem.model.nodes.items():
             if node.domain is not None and not node.value_shape and node.is_stochastic:
                 states = {state: k for k, state in enumerate(node.domain.states)}
-                at = plan.tree.index.get((name, 0))
+                at = self.tree.index.get((name, 0))
                 if at is not None:
                     self._codes[name] = at, states
 
@@ -62,7 +64,7 @@ class Prepared:
 
     def states(self, evidence: Sequence[Mapping[str, Any]]) -> np.ndarray | None:
         """Positions of observed states, shape (sets, variables); None where a set needs a closer look."""
-        found = np.full((len(evidence), len(self.plan.tree.variables)), -1, dtype=np.int16)
+        found = np.full((len(evidence), len(self.tree.variables)), -1, dtype=np.int16)
         rows, columns, positions = [], [], []
         codes = self._codes
         try:
@@ -94,9 +96,20 @@ class Prepared:
             np.concatenate([f.marginals for f in found]),
         )
 
+    def asked_of(self, problem: Problem | None) -> Prepared:
+        """The same with the functions of a problem about the same net; None: with none."""
+        if problem is None:
+            own = self.problem
+            bare: Any = replace(own, net=None, model=own.model.without_functions(), cache={})  # type: ignore[arg-type]
+            problem = bare
+        found = copy.copy(self)
+        found.problem = replace(problem, observed={}, cache={})
+        found.net = replace(self.net, model=problem.model, static=[])  # which the tree holds
+        return found
+
     def posed(self, row: np.ndarray) -> tuple[Problem, dict[Any, int]]:
         """The question of one row of states."""
-        variables = self.plan.tree.variables
+        variables = self.tree.variables
         seen = {variables[v]: int(row[v]) for v in np.flatnonzero(row >= 0)}
         observed = {}
         for variable, state in seen.items():
@@ -119,6 +132,8 @@ class TablePosteriors(Posteriors):
     log_z : ndarray, shape (sets,)
     flat : ndarray, shape (sets, states of all variables)
     done : ndarray of bool, shape (sets,)
+        Whether a set was answered; of what is impossible the rows of ``flat`` are NaN.
+    impossible : dict, optional
     """
 
     def __init__(
@@ -128,14 +143,23 @@ class TablePosteriors(Posteriors):
         log_z: np.ndarray,
         flat: np.ndarray,
         done: np.ndarray,
+        impossible: Mapping[int, str] | None = None,
     ) -> None:
-        super().__init__([])
+        super().__init__([], impossible)
         self._prepared, self._states, self._log_z, self._flat = prepared, states, log_z, flat
         self._done = done
 
-    def __reduce__(self) -> Any:
-        """Pickles carry each posterior, without functions."""
-        return Posteriors, ([self._one(k) for k in range(len(self))],)
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles and files travel without functions."""
+        return {**self.__dict__, "_prepared": self._prepared.asked_of(None)}
+
+    def kept(self) -> Sequence[Posterior | None]:
+        return (self._some(),)
+
+    def bind(self, problems: Sequence[Problem | None]) -> None:
+        one = next((problem for problem in problems if problem is not None), None)
+        if one is not None:
+            self._prepared = self._prepared.asked_of(one)
 
     def __len__(self) -> int:
         return len(self._states)
@@ -175,15 +199,38 @@ class TablePosteriors(Posteriors):
         own = self._prepared
         problem, seen = own.posed(self._states[k])
         row = OneOfMany(own.bound, seen, float(self._log_z[k]), self._flat[k].copy())
-        return ExactPosterior(problem, own.engine, Solved(own.plan.net, row, None, []))
+        found = ExactPosterior(problem, own.engine, Solved(own.net, row, None, []))
+        if problem.net is None:  # of a file, or a pickle
+            found.problem, found._known = None, problem.inputs
+        return found
+
+    def _some(self) -> Posterior | None:
+        at = np.flatnonzero(self._done)
+        return self._one(int(at[0])) if at.size else None
+
+    def _each(self) -> Iterator[tuple[int, Posterior]]:
+        """None is kept by itself: the arrays of all stand side by side."""
+        return iter(())
+
+    def _free(self) -> list[str]:
+        own, known = self._prepared, np.flatnonzero((self._states >= 0).all(axis=0))
+        fixed = {own.tree.variables[v] for v in known}
+        kinds = own.problem.model.nodes
+        return [n for n in self.names if kinds[n].kind != "fixed" and (n, 0) not in fixed]
+
+    def _said(self) -> dict[str, Any]:
+        problem = self._prepared.problem
+        if problem.net is None:
+            return {}
+        return {"fingerprints": [fingerprint(problem.model)], "whose": [0]}
 
     def _whole(self, what: str) -> None:
-        if not self._done.all():
-            next(one for one in self._all(what) if one is None)
+        if self._done.sum() + len(self.impossible) < len(self._done):
+            list(self._all(what))
 
     def _place(self, name: str) -> slice | None:
         """Where the probabilities of a node without plates stand."""
-        tree = self._prepared.plan.tree
+        tree = self._prepared.tree
         node = self._prepared.problem.model.nodes.get(name)
         at = tree.index.get((name, 0))
         if node is None or node.value_shape or at is None:

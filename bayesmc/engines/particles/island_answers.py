@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -78,6 +78,28 @@ class IslandRows:
     def error(self) -> float:
         """Of the log evidence so far, with its bias of minus half its variance."""
         return float(np.sqrt(self._variance + 0.25 * self._variance**2))
+
+    @property
+    def state(self) -> dict[str, Any]:
+        """What is known besides the stretches."""
+        return {
+            "steps": self.steps, "exchanges": list(self.exchanges), "lines": list(self._lines),
+            "base": self._base, "variance": self._variance,
+        }  # fmt: skip
+
+    def since(self, stretches: int) -> list[tuple[Any, ...]]:
+        """Stretches from one on, with the increments of their rows."""
+        increments = self.increments[stretches:]
+        pairs = zip(self.stretches[stretches:], increments, strict=True)
+        return [(*stretch, own) for stretch, own in pairs]
+
+    def go_on(self, stretches: Sequence[tuple[Any, ...]], state: Mapping[str, Any]) -> None:
+        """Be where another one was, which gave its stretches and its state."""
+        self.stretches = [(rows, shares, groups) for rows, shares, groups, _ in stretches]
+        self.increments = [own for *_, own in stretches]
+        self.steps, self.exchanges = state["steps"], list(state["exchanges"])
+        self._lines = [(at, line) for at, line in state["lines"]]
+        self._base, self._variance = state["base"], state["variance"]
 
     def _groups(self) -> np.ndarray:
         """A number for each island, the same for those with an ancestor in common not long ago."""

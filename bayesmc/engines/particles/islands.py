@@ -19,10 +19,12 @@ from bayesmc.engines.filtering import (
     hand_over,
     observed_answers,
 )
+from bayesmc.engines.particles.compiled_step import is_worth_compiling
 from bayesmc.engines.particles.enough import warn_of_errors
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.island_answers import IslandRows, answered
 from bayesmc.engines.particles.island_rows import Passed, pass_rows
+from bayesmc.engines.particles.island_saved import SavedIslands
 from bayesmc.engines.particles.options import check_count, check_number
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.slice_steps import plates_apart
@@ -30,6 +32,7 @@ from bayesmc.errors import UnsupportedError
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.resampling import systematic
+from bayesmc.results import RunFile
 from bayesmc.workers import completed
 from bayesmc.workers.memory import drop, folder, shares_memory
 
@@ -105,6 +108,7 @@ class IslandFilter(FilterEngine):
     threshold: float = 0.9
 
     label: ClassVar[str] = "islands of particles"
+    saves: ClassVar[bool] = True
     spreads: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -180,19 +184,23 @@ class IslandFilter(FilterEngine):
         queries: Queries | None = None,
         progress: bool | None = None,
         executor: Any = None,
+        checkpoint: RunFile | None = None,
     ) -> FilteredParticles:
         if self.islands == 1:
-            return self.cloud.filter(problem, seed, keep=keep, queries=queries, progress=progress)
+            told: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
+            return self.cloud.filter(problem, seed, checkpoint=checkpoint, **told)
         why = self.refusal(problem) or self.unable(problem, Asked("filter", keep))
         if why is not None:
             raise UnsupportedError(why)
         try:
             with ExitStack() as stack:
                 where = stack.enter_context(folder()) if shares_memory(executor) else None
-                run = _Run(self, problem, seed, queries or {}, where, executor)
+                run = _Run(self, problem, seed, queries or {}, where, executor, checkpoint)
                 found = run.whole(
                     stack.enter_context(Progress(problem.steps, self.label, progress))
                 )
+            if checkpoint is not None:
+                checkpoint.finish(found)
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
         warn_of_errors(found, self.cloud)
@@ -222,10 +230,12 @@ class _Run:
         queries: Queries,
         where: str | None,
         executor: Any,
+        file: RunFile | None = None,
     ) -> None:
         self.engine, self.problem, self.queries, self.executor = engine, problem, queries, executor
+        island = _with_its_code(engine._island(), problem, file)
         self.shared = {
-            "problem": problem, "engine": engine._island(), "queries": queries, "seed": seed,
+            "problem": problem, "engine": island, "queries": queries, "seed": seed,
             "purpose": Purpose.FILTER, "folder": where,
         }  # fmt: skip
         count = engine.islands
@@ -236,10 +246,12 @@ class _Run:
         self.log = np.full(count, -np.log(count))
         self.rows = IslandRows(count)
         self.exchanged: list[int] = []
+        self.saved = None if file is None else SavedIslands(file, self.rows)
 
     def whole(self, bar: Progress) -> FilteredParticles:
         """All rows."""
-        k, ahead, steps = 0, _FIRST, self.problem.steps
+        (k, ahead), steps = self.begun(), self.problem.steps
+        bar.advance(k)
         try:
             while k < steps:
                 last = min(k + ahead, steps)
@@ -257,10 +269,28 @@ class _Run:
                     ahead = max(_LEAST, min(2 * (stop - k), _MOST))
                     last = stop
                 k = last
+                if self.saved is not None and k < steps:
+                    self.saved.passed(self.state(k, ahead))
         except (Exception, KeyboardInterrupt) as error:
             hand_over(error, self.posterior(k) if k else None)
             raise
         return self.posterior(steps)
+
+    def begun(self) -> tuple[int, int]:
+        """Rows that all islands have passed, and how many they pass next: of an earlier process, or none."""
+        state = None if self.saved is None else self.saved.begin(self.shared["folder"])
+        if state is None:
+            return 0, _FIRST
+        self.clouds, self.chances, self.log = state["clouds"], state["chances"], state["log"]
+        self.rng.bit_generator.state = state["generator"]
+        return state["passed"], state["ahead"]
+
+    def state(self, passed: int, ahead: int) -> dict[str, Any]:
+        """What another process needs to go on."""
+        return {
+            "passed": passed, "ahead": ahead, "clouds": self.clouds, "chances": self.chances,
+            "log": self.log, "generator": self.rng.bit_generator.state,
+        }  # fmt: skip
 
     def passed(self, first: int, last: int) -> list[Passed]:
         """Rows passed by all islands."""
@@ -348,3 +378,17 @@ class _Run:
         start = self.problem.series.start
         found.exchanged = np.array([start + k for k in self.rows.exchanges], dtype=int)
         return found
+
+
+def _with_its_code(engine: ParticleFilter, problem: SeriesProblem, file: RunFile | None) -> Any:
+    """The filter of an island; of a run that is saved with the kind of code it was begun with."""
+    if file is None:
+        return engine
+    if file.state is None:
+        compiled = engine.compiled
+        if compiled is None:
+            assert engine.particles is not None
+            compiled = is_worth_compiling(engine.particles, problem.steps)
+        file.state = {"compiled": compiled}
+        file.save(None, file.state)
+    return replace(engine, compiled=file.state["compiled"])

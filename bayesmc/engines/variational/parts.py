@@ -313,8 +313,8 @@ class FreePart:
     def draw(self, rng: np.random.Generator, draws: int) -> tuple[Values, np.ndarray]:
         if self.factor is None:
             raise UnsupportedError(
-                "this approximation was unpickled, and pickles carry no functions; call infer again, or draw "
-                "before pickling"
+                "this approximation was loaded or unpickled, and files and pickles carry no functions; "
+                "call infer again, or draw before"
             )
         z = rng.standard_normal((draws, len(self.mean)))
         full = self.root.ndim == 2

@@ -268,7 +268,7 @@ class WeightedEngine(Engine):
         if not isinstance(old, DrawsPosterior) or not self.continues(old.engine):
             return f"this one is {old!r}"
         if old.problem is None:
-            return "this one was unpickled, and pickles carry no functions"
+            return "this one was loaded or unpickled, and files and pickles carry no functions"
         if set(old._stored) != names:
             return "this one kept other nodes"
         if (old.log_weights is not None) != self.is_weighted(problem):

@@ -81,12 +81,11 @@ class Pool(NamedTuple):
         return np.flatnonzero(several[self.home])
 
     def taken(self, ancestors: np.ndarray) -> Pool:
-        """Those of ancestors, shape ``(particles,)`` or ``(particles, *apart)``."""
+        """Those of ancestors, as many as wanted: shape ``(wanted,)`` or ``(wanted, *apart)``."""
         chosen = ancestors.reshape(len(ancestors), -1).T
-        found = [
-            g._replace(which=np.take_along_axis(g.which, np.broadcast_to(chosen, g.which.shape), 1))
-            for g in self.generations
-        ]
+        groups = len(self.generations[0].which)
+        at = np.broadcast_to(chosen, (groups, chosen.shape[1]))
+        found = [g._replace(which=np.take_along_axis(g.which, at, 1)) for g in self.generations]
         return self._replace(generations=tuple(found))
 
     def of_one(self) -> Pool:
