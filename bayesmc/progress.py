@@ -47,7 +47,7 @@ class Progress:
         """Say something else in front of the bar from now on."""
         self.label = label
         if self._bar is not None:
-            self._bar.set_description(label)
+            self._bar.set_description(label, refresh=False)
 
     def __enter__(self) -> Progress:
         return self

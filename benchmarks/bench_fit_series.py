@@ -141,7 +141,7 @@ def main(names: list[str]) -> None:
         start = time.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = bmc.fit(dbn, data, inputs=inputs, engine=engine, progress=True)
+            found = bmc.fit(dbn, data, inputs=inputs, engine=engine)
         spent = time.process_time() - start
         ends = ", ".join(f"{end:.3f}" for end in found.climbs)
         rows.append([name, f"{found.log_likelihood:.6f}", f"{spent:.1f}", ends])

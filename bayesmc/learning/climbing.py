@@ -107,6 +107,7 @@ def maximum(
         bar.tell(f"fit: climb {len(ended) + 1}")
         ended.append(_climbed(objective, starts[at], heights[at], tolerance, max_iterations, bar))
     bar.tell("fit: curvature")
+    bar.advance()
     best = max(ended, key=lambda climb: climb.value)
     _settle(objective, best.u)
     value = objective.value(best.u)

@@ -109,8 +109,6 @@ class SeriesEvidence(Evidence):
 
     def _at_once(self, us: np.ndarray) -> np.ndarray | None:
         """Values at several points by one pass, held against single ones until they have agreed."""
-        if isinstance(self.engine, GridFilter) and self.engine.grid is None:
-            return None
         try:
             points = [self.unknowns.values(u) for u in us]
             if self._together is None:

@@ -17,6 +17,7 @@ from bayesmc.dbn import UNCOMPARED, DynamicBayesNet, SeriesProblem
 from bayesmc.dbn.series import Series
 from bayesmc.dbn.slices import PREVIOUS, Slices, SliceStore
 from bayesmc.engines.filtering import FilterEngine
+from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.errors import BayesmcError
 from bayesmc.network.declaring import DeclaredPlates
 from bayesmc.network.evidence import Observed
@@ -24,8 +25,8 @@ from bayesmc.network.node import Declaration
 
 #: what the plate of points is called; no name of a user's
 _POINT = "\u200bpoint"
-#: numbers in a slice beyond which points side by side save nothing
-_LARGE = 1000
+#: numbers in a slice beyond which points side by side save nothing, and in all that are held at once
+_LARGE, _HELD = 1000, 2e7
 #: points that are asked in one pass at most
 _MOST = 64
 #: how close evidences must be to those of a pass each, and misses in a row after which nobody asks again
@@ -46,11 +47,7 @@ class SeveralPoints:
         self.problem, self.engine = problem, engine
         self._made: dict[int, tuple[DynamicBayesNet, Slices, Series]] = {}
         self._trusted, self._failed = False, 0
-        nodes = [problem.model[n] for n in problem.slices.dynamic]
-        if sum(math.prod(node.value_shape) for node in nodes) > _LARGE:
-            self._failed = _FAILURES
-        if any(node.is_object for node in nodes) or problem.series.start:
-            self._failed = _FAILURES
+        self._most = min(_MOST, _numbers_that_fit(problem, engine))
 
     def log_evidences(self, points: Sequence[Mapping[str, np.ndarray]]) -> np.ndarray | None:
         """The log evidence at each point; None where it cannot be told for all at once.
@@ -60,9 +57,10 @@ class SeveralPoints:
         points : sequence of dict
             Static node -> stored value, the same nodes in all.
         """
-        if self._failed >= _FAILURES:
+        if self._failed >= _FAILURES or self._most < 2:
             return None
-        parts = [self._asked(points[k : k + _MOST]) for k in range(0, len(points), _MOST)]
+        starts = range(0, len(points), self._most)
+        parts = [self._asked(points[k : k + self._most]) for k in starts]
         if any(part is None for part in parts):
             return None
         self._failed = 0
@@ -102,7 +100,14 @@ class SeveralPoints:
                 found = self.engine.filter(
                     asked, np.random.SeedSequence(0), progress=False
                 ).log_marginal_likelihood
-        except (BayesmcError, ValueError, TypeError, IndexError):  # one by one says what is wrong
+        except (
+            BayesmcError,
+            ArithmeticError,
+            LookupError,
+            MemoryError,
+            TypeError,
+            ValueError,
+        ):  # one by one says what is wrong
             return None
         found = np.asarray(found, dtype=float)
         if not found.ndim or found.shape[0] != count:
@@ -111,6 +116,25 @@ class SeveralPoints:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _numbers_that_fit(problem: SeriesProblem, engine: FilterEngine) -> int:
+    """How many points may be asked at once, by what a filter would hold; 0 where it saves nothing."""
+    model, names = problem.model, problem.slices.dynamic
+    width = sum(math.prod(model[n].value_shape) for n in names)
+    if width > _LARGE or problem.series.start or any(model[n].is_object for n in names):
+        return 0
+    hidden = [model[n] for n in problem.hidden if model[n].is_stochastic]
+    if isinstance(engine, GridFilter) and (
+        len(engine.grid or ()) != 1
+        or any(n.domain is None and n.value_shape for n in hidden)
+        or any(n.domain is not None for n in hidden)
+    ):
+        return 0  # pairs of cells, not calls, are what takes its time
+    joint = math.prod(
+        float(n.domain.size) ** math.prod(n.plate_shape) for n in hidden if n.domain is not None
+    )
+    return int(_HELD / (problem.steps * (width + joint**2)))
 
 
 def _plated(problem: SeriesProblem, count: int) -> tuple[DynamicBayesNet, Slices, Series]:
