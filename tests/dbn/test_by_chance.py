@@ -198,3 +198,30 @@ def test_parameters_are_fitted_behind_a_lag() -> None:
         found.append(bmc.fit(dbn, rows, restarts=1))
     assert found[0].log_likelihood == pytest.approx(found[1].log_likelihood, abs=1e-8)
     assert found[0].converged
+
+
+def test_switching_filters_carry_both_kinds_of_lag() -> None:
+    def modes(form: str) -> bmc.DynamicBayesNet:
+        lag = form == "lag"
+        dbn = bmc.DynamicBayesNet()
+        dbn.add("s", lambda s_prev: bmc.Bernoulli(0.1 + 0.8 * s_prev), initial=bmc.Bernoulli(0.5))
+        copy = (lambda s_prev: s_prev) if lag else lambda s_prev: bmc.Bernoulli(1.0 * s_prev)
+        dbn.add("s_lag", copy, initial=bmc.Bernoulli(0.3))
+
+        @dbn.node(initial=bmc.Normal(0.0, 1.0))
+        def x(x_prev: Any, x_lag_prev: Any, s: Any, s_lag: Any) -> Any:
+            return bmc.Normal(1.1 * x_prev - 0.3 * x_lag_prev + s - 0.5 * s_lag, 0.5)
+
+        same = (lambda x_prev: x_prev) if lag else lambda x_prev: bmc.Normal(x_prev, 0.0)
+        dbn.add("x_lag", same, initial=bmc.Normal(0.0, 1.0))
+        dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+        return dbn
+
+    rows = {"y": [0.1, 0.9, 2.2, 2.0]}
+    for engine in (None, bmc.SwitchingKalmanFilter()):
+        one, other = (bmc.filter(modes(form), rows, engine=engine) for form in ("lag", "point"))
+        np.testing.assert_allclose(one.mean("x_lag"), other.mean("x_lag"), atol=1e-9)
+        np.testing.assert_allclose(one.mean("s_lag"), other.mean("s_lag"), atol=1e-9)
+        assert one.log_marginal_likelihood == pytest.approx(other.log_marginal_likelihood)
+    exact = bmc.infer(modes("lag"), rows, engine=bmc.Exact())
+    assert exact.log_marginal_likelihood == pytest.approx(one.log_marginal_likelihood, abs=0.05)
