@@ -110,6 +110,19 @@ def at_index(index: Shape) -> str:
     return f" at index {index if len(index) > 1 else index[0]}" if index else ""
 
 
+def from_one(low: int, high: int, size: int) -> str:
+    """What to do about positions beyond the last that look as if counted from 1; nothing where they do not.
+
+    Examples
+    --------
+    >>> from bayesmc.shapes import from_one
+    >>> from_one(1, 3, 3), from_one(0, 3, 3)
+    ('; positions count from 0: if these count from 1, subtract 1', '')
+    """
+    counted = low >= 1 and high == size
+    return "; positions count from 0: if these count from 1, subtract 1" if counted else ""
+
+
 def masks(size: int) -> list[np.ndarray]:
     """Sets of elements such that for any two, one set holds the first and not the second."""
     bits = [(np.arange(size) >> k) & 1 == 1 for k in range(max((size - 1).bit_length(), 1))]

@@ -16,6 +16,7 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, 
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.marginal.options import asking, is_worth_it
+from bayesmc.engines.options import engine_meant
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.refusals import common_refusal
@@ -140,7 +141,8 @@ def checked_engine(engine: Any) -> FilterEngine:
         )
     if not isinstance(engine, FilterEngine):
         raise TypeError(
-            f"engine={engine!r} is no engine over time; use ParticleFilter(particles), KalmanFilter(), "
+            f"engine={engine!r} is no engine over time{engine_meant(engine)}; use "
+            "ParticleFilter(particles), KalmanFilter(), "
             "DiscreteFilter(), ..., or unroll the template for a static engine"
         )
     return engine

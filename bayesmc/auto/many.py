@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Never
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.several import Folder, in_folder, seed_of
 from bayesmc.auto.static import able, check_keep, checked_answer, choice, run_saved
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.exact.many import Prepared, TablePosteriors
@@ -40,10 +41,11 @@ _UNITS, _MOST = 8, 64
 _NAMED = 10
 
 
+@by_keyword
 def infer_many(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Any,
-    *,
+    *beyond: Never,
     inputs: Mapping[str, Any] | Sequence[Mapping[str, Any]] | None = None,
     engine: Any = None,
     rng: Any = None,
@@ -117,6 +119,8 @@ def infer_many(
     >>> posteriors.probabilities("rain").round(3).tolist()
     [[0.308, 0.692], [0.973, 0.027], [0.8, 0.2]]
     """
+    if beyond:
+        refuse_positions(infer_many, beyond)
     check_executor("infer_many", executor)
     if on_impossible not in ("raise", "nan"):
         raise ValueError(

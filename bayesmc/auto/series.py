@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple, Never, overload
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from bayesmc.auto.switching import settled_or_kim
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.frames import times_ahead
 from bayesmc.dbn.given import check_steps
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, picks_told, read_queries
 from bayesmc.engines.particles.filter import ParticleFilter
@@ -33,10 +34,11 @@ def filter(
 def filter(
     dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
 ) -> list[SeriesPosterior]: ...
-def filter(  # type: ignore[misc]
+@by_keyword  # type: ignore[misc]
+def filter(
     dbn: DynamicBayesNet,
     observations: Any,
-    *,
+    *beyond: Never,
     inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
@@ -104,6 +106,8 @@ def filter(  # type: ignore[misc]
     >>> filtered.std("x").shape
     (3,)
     """
+    if beyond:
+        refuse_positions(filter, beyond)
     if executor is not None:
         check_executor("filter", executor)
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
@@ -130,10 +134,11 @@ def smooth(
 def smooth(
     dbn: DynamicBayesNet, observations: Sequence[Mapping[str, Any]], **options: Any
 ) -> list[SeriesPosterior]: ...
-def smooth(  # type: ignore[misc]
+@by_keyword  # type: ignore[misc]
+def smooth(
     dbn: DynamicBayesNet,
     observations: Any,
-    *,
+    *beyond: Never,
     inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
@@ -180,6 +185,8 @@ def smooth(  # type: ignore[misc]
     >>> bmc.smooth(dbn, {"umbrella": [1, 1]}).probabilities("rain").round(3).tolist()
     [[0.117, 0.883], [0.117, 0.883]]
     """
+    if beyond:
+        refuse_positions(smooth, beyond)
     if executor is not None:
         check_executor("smooth", executor)
     options = {
@@ -200,10 +207,11 @@ def smooth(  # type: ignore[misc]
     return found
 
 
+@by_keyword
 def forecast(
     dbn: DynamicBayesNet | OnlineBelief,
     observations: Any = None,
-    *,
+    *beyond: Never,
     steps: int,
     inputs: Any = None,
     engine: FilterEngine | None = None,
@@ -230,6 +238,8 @@ def forecast(
     >>> bmc.forecast(dbn, {"x": [2.0]}, steps=3).mean("x").tolist()
     [1.0, 0.5, 0.25]
     """
+    if beyond:
+        refuse_positions(forecast, beyond)
     check_steps("forecast", steps)
     if isinstance(dbn, OnlineBelief):
         return _from_belief(dbn, observations, steps, inputs, engine, queries)
@@ -248,10 +258,11 @@ def forecast(
     return found
 
 
+@by_keyword
 def most_likely(
     dbn: DynamicBayesNet,
     observations: Any,
-    *,
+    *beyond: Never,
     inputs: Any = None,
     engine: FilterEngine | None = None,
     rng: Any = None,
@@ -270,6 +281,8 @@ def most_likely(
     >>> bmc.most_likely(dbn, {"umbrella": [1, 0, 0]})["rain"].tolist()
     ['yes', 'no', 'no']
     """
+    if beyond:
+        refuse_positions(most_likely, beyond)
     problem = pose_series(dbn, observations, inputs)
     chosen = engine_for(problem, engine, Asked("most_likely"))
     return chosen.most_likely(problem, seed_sequence(rng), progress)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
@@ -14,12 +14,14 @@ from bayesmc.auto.files import Opened
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import Laplace
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.approximate.laplace import LaplaceApproximation
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
+from bayesmc.engines.options import engine_meant
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
@@ -32,10 +34,11 @@ from bayesmc.workers import check_executor
 _CHEAP = 256 * 2**20
 
 
+@by_keyword
 def infer(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Any = None,
-    *,
+    *beyond: Never,
     inputs: Any = None,
     engine: Any = None,
     rng: Any = None,
@@ -103,6 +106,8 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
+    if beyond:
+        refuse_positions(infer, beyond)
     if executor is not None:
         check_executor("infer", executor)
     problem = pose_any(net, evidence, inputs, resume)
@@ -286,7 +291,8 @@ def _checked(engine: Any) -> Any:
         )
     if not isinstance(engine, Engine):
         raise TypeError(
-            f"engine={engine!r} is not an engine; use Exact(), Gibbs(draws), LikelihoodWeighting(draws), ..."
+            f"engine={engine!r} is not an engine{engine_meant(engine)}; use Exact(), Gibbs(draws), "
+            "LikelihoodWeighting(draws), ..."
         )
     return engine
 

@@ -8,9 +8,9 @@ from collections.abc import Collection
 from bayesmc.errors import did_you_mean
 
 #: names by which one may try to look further back: x_prev2, x_prev_prev, x_2prev, x_lag2
-_FAR_BACK = re.compile(r"(.+?)_?(?:prev(?:_?prev)+|prev_?\d+|\d+_?prev|prev_?\d+_prev|lag_?\d+)")
+_FAR_BACK = re.compile(r"(.+?)_?(?:prev((_?prev)+|_?\d+(_prev)?)|\d+_?prev|lag_?(?!1$)\d+)")
 #: other ways to write that of the slice before
-_TURNED = re.compile(r"(?:prev|previous|last)_(.+)")
+_TURNED = re.compile(r"(?:prev|previous|last)_(.+)|(.+?)_(?:t_?1|tm1|previous|last|lag_?1?)")
 #: names of nodes of the unrolled net
 _UNROLLED = re.compile(r"(.+)\[\d+\]")
 
@@ -22,8 +22,9 @@ def meant(name: str, nodes: Collection[str], static: Collection[str]) -> str:
         return f"rows go under the name {slice_[1]!r}, time first: row k belongs to slice k"
     before = [n + "_prev" for n in nodes if n not in static]
     turned = _TURNED.fullmatch(name)
-    named = turned[1] + "_prev" if turned and turned[1] + "_prev" in before else name
-    return f"the template has no node {name!r}{did_you_mean(named, [*nodes, *before, 't'])}"
+    named = (turned[1] or turned[2]) + "_prev" if turned else name
+    hint = did_you_mean(named if named in before else name, [*nodes, *before, "t"])
+    return f"the template has no node {name!r}{hint}"
 
 
 def far_back(name: str, nodes: Collection[str], static: Collection[str]) -> str | None:

@@ -326,11 +326,11 @@ class Distribution:
         self.invalid = none if self.invalid is None else self.invalid | none
         self.problem = self.problem or error
 
-    def _finite(self, name: str, value: np.ndarray) -> np.ndarray:
+    def _finite(self, name: str, value: np.ndarray, wanted: str = "finite") -> np.ndarray:
         """A scalar parameter that must be finite."""
         if all_finite(value):  # cheaper than looking at every element
             return value
-        return self._check(name, value, np.isfinite(value), 0.0, "finite")
+        return self._check(name, value, np.isfinite(value), 0.0, wanted)
 
     def _positive(self, name: str, value: np.ndarray) -> np.ndarray:
         """A scalar parameter that must be positive and finite."""

@@ -22,6 +22,8 @@ _UNDERFLOWS = 0.05  # a Gamma or Beta variate of smaller concentration can under
 
 #: times ``sqrt(df)`` from where on a Student t is its power law to the last digit; SciPy errs farther out
 _FAR = 1e9
+#: what the bounds of a uniform distribution must be
+_BOUNDED = "finite (for a flat prior take a wide Normal, such as Normal(0, 100))"
 _HALF_LOG_PI = 0.5 * float(np.log(np.pi))
 
 
@@ -155,7 +157,7 @@ class Uniform(Distribution):
     def __init__(self, low: Any = 0.0, high: Any = 1.0) -> None:
         low, high = as_float(low), as_float(high)
         self._set_batch(low.shape, high.shape)
-        self.low = self._finite("low", low)
+        self.low = self._finite("low", low, _BOUNDED)
         with np.errstate(over="ignore", invalid="ignore"):
             width = high - self.low
             ok = (width > 0) & (width < np.inf)
@@ -163,7 +165,13 @@ class Uniform(Distribution):
         if not ok.all():
             high = np.broadcast_to(high, self.batch_shape)
             above = np.asarray(self.low + np.maximum(1.0, np.abs(self.low)))
-            self.high = self._check("high", high, ok, above, "finite and above low")
+            self.high = self._check(
+                "high",
+                high,
+                ok,
+                above,
+                _BOUNDED if np.isinf(high).any() else "finite and above low",
+            )
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.random(shape))

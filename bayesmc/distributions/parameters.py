@@ -1,16 +1,19 @@
-"""Parameters as users write them: names that a family does not have, and numbers that are none."""
+"""Arguments as users write them: names that a family or an engine does not have, numbers that are none,
+and arguments that go by keyword."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 import math
-from collections.abc import Iterable, KeysView
-from typing import Any
+from collections.abc import Callable, Iterable, KeysView, Mapping
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
 from bayesmc.errors import BayesmcError, ParameterError, did_you_mean
+
+_Call = TypeVar("_Call", bound=Callable[..., Any])
 
 #: another name -> what it is called here, or how to say it: the first that a family takes
 _OTHERWISE: dict[str, tuple[tuple[str, str], ...]] = {
@@ -90,6 +93,56 @@ def check_keywords(family: type, keywords: KeysView[str]) -> None:
             )
 
 
+class Named:
+    """What data classes of options are built from: an option they do not have goes to ``refuse_option``."""
+
+    def __new__(cls, *_: Any, **options: Any) -> Any:
+        if options:
+            known: Any = getattr(getattr(cls.__init__, "__code__", None), "co_varnames", options)
+            for name in options:
+                if name not in known:
+                    cls.refuse_option(name)
+        return super().__new__(cls)
+
+    @classmethod
+    def refuse_option(cls, name: str) -> None:
+        """Raise for an option, if it is none; what is not raised for meets the constructor."""
+
+
+def by_keyword(call: _Call) -> _Call:
+    """A call whose ``*beyond`` are arguments that go by keyword; its signature does not show them.
+
+    It is no wrapper: warnings count the calls up to the user's own line.
+    """
+    signed = inspect.signature(call)
+    kept = [p for p in signed.parameters.values() if p.kind is not p.VAR_POSITIONAL]
+    call.__signature__ = signed.replace(parameters=kept)  # type: ignore[attr-defined]
+    return call
+
+
+def refuse_positions(call: Callable[..., Any], beyond: tuple[Any, ...]) -> NoReturn:
+    """Raise for arguments by position that go by keyword, with what to write.
+
+    Raises
+    ------
+    TypeError
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> bmc.infer(bmc.BayesNet(), {}, {"x": 1.0})
+    Traceback (most recent call last):
+        ...
+    TypeError: infer takes what follows evidence by keyword; write infer(net, evidence, inputs=...)
+    """
+    parameters = inspect.signature(call).parameters.values()
+    leading = [p.name for p in parameters if p.kind is p.POSITIONAL_OR_KEYWORD]
+    named = [p.name for p in parameters if p.kind is p.KEYWORD_ONLY]
+    written = ", ".join([*leading, f"{_looks_like(beyond[0], named)}=..."])
+    name = call.__name__
+    raise TypeError(f"{name} takes what follows {leading[-1]} by keyword; write {name}({written})")
+
+
 def read_floats(value: Any) -> np.ndarray:
     """A parameter as a float array; text is no number even where it could be read as one.
 
@@ -136,3 +189,11 @@ def _meant(keyword: str, known: Iterable[str]) -> str:
         if parameter in known:
             return f" (did you mean {said}?)"
     return did_you_mean(keyword, known)
+
+
+def _looks_like(value: Any, named: list[str]) -> str:
+    """The keyword that a value looks like."""
+    looks = "rng" if isinstance(value, int) else "engine"
+    if isinstance(value, Mapping) or hasattr(value, "columns"):
+        looks = "inputs"
+    return looks if looks in named else named[0]

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.distributions.faults import missing
+from bayesmc.engines.options import Options
 from bayesmc.errors import BayesmcError
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
 from bayesmc.results import Posterior
@@ -65,7 +66,7 @@ def in_file(keep: Any) -> bool:
     return keep == "file" or isinstance(keep, Mapping)
 
 
-class Engine:
+class Engine(Options):
     """Base of the engines; a family supplies ``refusal``, ``describe`` and ``run``.
 
     ``infer`` is the way in. An engine that cannot answer says why and names one that can.

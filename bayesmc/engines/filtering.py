@@ -26,6 +26,7 @@ from bayesmc.dbn import (
 )
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
+from bayesmc.engines.options import Options
 from bayesmc.engines.picks import pick_outside
 from bayesmc.engines.refusals import common_refusal
 from bayesmc.errors import (
@@ -77,7 +78,7 @@ def read_queries(call: str, queries: Any) -> Queries:
     return queries
 
 
-class FilterEngine:
+class FilterEngine(Options):
     """Base of the engines over time; ``filter``, ``smooth``, ``forecast`` and ``most_likely`` are the way in.
 
     A family supplies ``refusal``, ``treatment`` and ``filter``, and of the other questions those that it can
@@ -93,8 +94,7 @@ class FilterEngine:
     spreads: ClassVar[bool] = False  #: whether ``filter`` takes an ``executor``
     #: whether ``filter`` takes ``checkpoint=`` and saves itself as it goes on; others are saved at the end
     saves: ClassVar[bool] = False
-    #: whether its answers are the model's, up to rounding
-    is_exact: ClassVar[bool] = False
+    is_exact: ClassVar[bool] = False  #: whether its answers are the model's, up to rounding
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         """Why this engine cannot answer, or None; a family's own reasons come after the common ones."""

@@ -22,7 +22,8 @@ def read_data(path: str | PathLike[str]) -> dict[str, np.ndarray]:
     Either may be compressed (``.gz``). Missing numbers (``NA``, ``null``) are NaN, as evidence has them;
     whole numbers are integers. Arrays come as the program meant them: ``structure(c(...), .Dim=)`` by
     columns, ``list(y = structure(.Data=c(...), .Dim=))`` of WinBUGS by rows. Indices count from 1 in these
-    programs and from 0 here: labels such as ``group`` are handed over as they are.
+    programs and from 0 here: labels such as ``group``, and the codes of R's factors, are handed over as they
+    are (``group - 1`` is the position here). Lists within the data, and data frames, are refused.
 
     Parameters
     ----------

@@ -3,6 +3,9 @@
 Text only. In R, and so for JAGS and Stan, the first index of ``structure(c(...), .Dim = c(2, 3))`` runs
 fastest. WinBUGS and OpenBUGS write ``list(y = structure(.Data = c(...), .Dim = c(2, 3)))``, and there the
 last index does (OpenBUGS user manual, "Model Specification: Formatting of Data").
+
+Of what ``structure`` sets only the dimensions are numbers; names, levels and classes are passed over, so that
+a factor is its codes, which R counts from 1. Lists within, and data frames, are no arrays and refused.
 """
 
 from __future__ import annotations
@@ -26,7 +29,12 @@ _TOKEN = re.compile(
 )
 _CONSTANTS = {"NA": np.nan, "NaN": np.nan, "Inf": np.inf, "TRUE": True, "FALSE": False,
               "T": True, "F": False, "NA_real_": np.nan, "NA_integer_": np.nan}  # fmt: skip
-_EMPTY = ("integer", "numeric", "double")
+_EMPTY = {"integer": np.int64, "numeric": np.float64, "double": np.float64, "logical": np.bool_}
+#: conversions that older versions of R write around values, and ``as.vector``, which drops dimensions
+_AS = ("as.integer", "as.numeric", "as.double", "as.logical", "as.vector")
+_CALLS = ("c", "structure", *_EMPTY, *_AS)
+#: arguments of ``structure`` that are numbers; others are texts or lists, and no part of an array
+_NUMBERS = ("data", "dim")
 
 
 class _Token(NamedTuple):
@@ -51,6 +59,8 @@ def parse_rdump(text: str, path: str | PathLike[str] | None = None) -> dict[str,
     >>> parse_rdump("list(N = 2, y = structure(.Data = c(1, 2, 3, 4, 5, 6), .Dim = c(2, 3)))")["y"]
     array([[1, 2, 3],
            [4, 5, 6]])
+    >>> parse_rdump('sex <- structure(as.integer(c(2, 1)), .Label = c("f", "m"), class = "factor")')
+    {'sex': array([2, 1])}
     """
     return _Reader(text, path).everything()
 
@@ -135,8 +145,8 @@ class _Reader:
             self._fail(f"{name!r} is given twice")
         found[name] = np.asarray(value)
 
-    def _arguments(self) -> list[tuple[str | None, Any]]:
-        """What stands in brackets: values, some with names."""
+    def _arguments(self, skips: bool = False) -> list[tuple[str | None, Any]]:
+        """What stands in brackets: values, some with names; attributes of an array are passed over."""
         found: list[tuple[str | None, Any]] = []
         self._take("(")
         while self.now.text != ")":
@@ -144,11 +154,21 @@ class _Reader:
             name = self._named() if named else None
             if named:
                 self._next()
-            found.append((name, self._value()))
+            if skips and name is not None and _bare(name) not in _NUMBERS:
+                self._skip()
+            else:
+                found.append((name, self._value()))
             if self.now.text != ")":
                 self._take(",")
         self._next()
         return found
+
+    def _skip(self) -> None:
+        """Pass over one argument, whatever it is."""
+        depth = 0
+        while self.now.kind != "end" and (depth or self.now.text not in (",", ")")):
+            depth += (self.now.text == "(") - (self.now.text == ")")
+            self._next()
 
     def _value(self) -> Any:
         """One value; of two with a colon between, the whole numbers from one to the other."""
@@ -181,19 +201,36 @@ class _Reader:
         return self._fail(f"a number is wanted, and {self._shown()} is there")
 
     def _call(self, token: _Token) -> Any:
-        given = self._arguments()
-        if token.text == "c":
-            parts = [np.atleast_1d(value) for _, value in given]
-            return _whole(np.concatenate(parts)) if parts else np.zeros(0)
-        if token.text in _EMPTY and len(given) <= 1:
-            count = int(given[0][1]) if given else 0
-            return np.zeros(count, int if token.text == "integer" else float)
+        if token.text == "list":
+            raise FileFormatError(
+                "list(...) within the data is no array (a data frame is one, too): dump its columns as "
+                "variables of their own, in R with(d, dump(names(d), file))",
+                self.path,
+                token.line,
+            )
+        if token.text not in _CALLS:
+            raise FileFormatError(
+                f"{token.text}(...) is not known here (known are {', '.join(_CALLS)}); dump its value",
+                self.path,
+                token.line,
+            )
+        given = self._arguments(skips=token.text == "structure")
         if token.text == "structure":
             return self._array(given)
-        raise FileFormatError(f"{token.text}(...) is not known here", self.path, token.line)
+        if token.text == "c":
+            parts = [np.ravel(value, order="F") for _, value in given]
+            return _whole(np.concatenate(parts)) if parts else np.zeros(0)
+        if token.text in _AS:
+            if len(given) != 1:
+                self._fail(f"{token.text}(...) takes one value, and {len(given)} are given")
+            return _converted(token.text, given[0][1])
+        count = given[0][1] if given else 0
+        if len(given) > 1 or np.ndim(count) or not 0 <= count < np.inf:
+            self._fail(f"{token.text}(n) takes one length")
+        return np.zeros(int(count), _EMPTY[token.text])
 
     def _array(self, given: list[tuple[str | None, Any]]) -> np.ndarray:
-        parts = {("" if name is None else name.lstrip(".")).lower(): value for name, value in given}
+        parts = {"" if name is None else _bare(name): value for name, value in given}
         data = parts.get("data", parts.get(""))
         if data is None:
             return np.asarray(self._fail("structure(...) holds no data"))
@@ -204,6 +241,22 @@ class _Reader:
                 f".Dim = {shape} takes {np.prod(shape)} numbers, and {np.size(data)} are given"
             )
         return np.asarray(data).reshape(shape, order="C" if by_rows else "F")
+
+
+def _bare(name: str) -> str:
+    """``.Dim`` and ``dim`` are one: older and newer versions of R."""
+    return name.lstrip(".").lower()
+
+
+def _converted(call: str, value: Any) -> np.ndarray:
+    """As R converts: dimensions go, fractions are cut off towards zero, missing values stay."""
+    flat = np.ravel(value, order="F") if np.ndim(value) > 1 else np.asarray(value)
+    known = ~np.isnan(flat)
+    if call == "as.integer":
+        return _whole(np.where(np.isfinite(flat), np.trunc(flat), np.nan))[()]
+    if call == "as.logical":
+        return flat != 0 if known.all() else np.where(known, flat != 0, np.nan)
+    return flat
 
 
 def _whole(values: np.ndarray) -> np.ndarray:

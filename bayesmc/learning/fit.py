@@ -327,7 +327,8 @@ def _starts(
     for name in start:
         if name not in unknowns.names:
             raise ModelError(
-                f"fit: start= names {name!r}, which is not learned: {list(unknowns.names)}"
+                f"fit: start= names {name!r}, which is not learned{did_you_mean(name, unknowns.names)}: "
+                f"{list(unknowns.names)}"
             )
     if start and len(start) == len(unknowns.names):
         given = unknowns.numbers(start)[None]

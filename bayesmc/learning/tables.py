@@ -270,7 +270,9 @@ def _begin(name: str, table: np.ndarray, start: Mapping[str, Any]) -> np.ndarray
 def _check_names(start: Mapping[str, Any], begin: Tables) -> None:
     for name in start:
         if name not in begin:
-            raise ModelError(f"fit: start= names {name!r}, which is not learned: {list(begin)}")
+            raise ModelError(
+                f"fit: start= names {name!r}, which is not learned{did_you_mean(name, begin)}: {list(begin)}"
+            )
 
 
 def _dirichlet(tables: Tables, counts: Any) -> dict[str, np.ndarray]:

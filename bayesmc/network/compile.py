@@ -22,6 +22,7 @@ from bayesmc.errors import (
     StateError,
 )
 from bayesmc.network.calling import Aligner, RowAligner
+from bayesmc.network.clashing import data_around, sizes_in
 from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
@@ -161,6 +162,10 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
             node.called(entry(node, model.probe, model.probe_shape))
         except BayesmcError as alone:
             raise alone from alone.__cause__
+        sizes = sizes_in(str(error.__cause__), model.probe_shape)
+        around = data_around(node.declaration, node.plate_shape, sizes)
+        if around is not None:
+            raise BroadcastError(f"node {node.name!r}: {around}") from error
         instead = "np.exp for math.exp" if "Python scalars" in str(error) else "np.where for if"
         raise BroadcastError(
             f"node {node.name!r} works on one value at a time but not on arrays of them: "

@@ -7,7 +7,7 @@ that they were made for.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -399,17 +399,22 @@ def check_parents(
     what: str = "node",
 ) -> None:
     """Refuse a parent that was never declared."""
+    others = [n for n in declarations if n != name]
     for parent in parents:
         if parent not in declarations:
             raise UnknownNodeError(
-                f"{what} {name!r} has the parent {parent!r}: {unknown(declarations, parent)}. Declare it, "
+                f"{what} {name!r} has the parent {parent!r}: {unknown(others, parent)}. Declare it, "
                 "give the argument a default if it is no parent, or name the parents with parents="
             )
 
 
-def unknown(declarations: Mapping[str, Declaration], name: str) -> str:
+def unknown(declarations: Iterable[str], name: str) -> str:
     """That there is no such node, and which one may be meant."""
-    return f"the net has no node {name!r}{did_you_mean(name, declarations)}"
+    others = list(declarations)
+    known = (
+        f" (its nodes are {', '.join(others[:12])}{', ...' * (len(others) > 12)})" if others else ""
+    )
+    return f"the net has no node {name!r}{did_you_mean(name, declarations) or known}"
 
 
 # ---- private ------------------------------------------------------------------------------------

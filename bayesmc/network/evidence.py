@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
+from bayesmc.network.clashing import many_axes, refuse_misplaced, surplus
 from bayesmc.network.labels import by_label, oriented, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, observed_links
@@ -113,7 +114,11 @@ def read_question(
 ) -> tuple[Any, Model, dict[str, Observed], dict[str, np.ndarray]]:
     """A snapshot of a net, its model for the data, and evidence and inputs as stored values."""
     given = evidence if isinstance(evidence, Mapping) else {}
-    model = net.model(given, inputs)
+    try:
+        model = net.model(given, inputs)
+    except EvidenceError:
+        refuse_misplaced(net, given, inputs)
+        raise
     links = observed_links(model.nodes, given)
     if links:
         net = net.with_links(links)
@@ -206,9 +211,11 @@ def plate_sizes(
                 if sizes[plate] is None:
                     sizes[plate], source[plate] = size, name
                 elif sizes[plate] != size and plate in source:
+                    shapes = {n: _shape(v) for data_of in data for n, v in (data_of or {}).items()}
                     raise PlateError(
                         f"plate {plate!r} has size {sizes[plate]} in the data of {source[plate]!r} but "
                         f"{size} in that of {name!r}"
+                        + many_axes(shapes, declarations, (source[plate], name))
                     )
     known = [(n, v) for values in data for n, v in (values or {}).items() if n in declarations]
     refuse_crossed([(n, v, declarations[n].plates) for n, v in known], labels)
@@ -337,9 +344,10 @@ def _allowed(node: CompiledNode) -> str:
 
 def _shape_message(node: CompiledNode, shape: Shape) -> str:
     plates = ", ".join(f"{p}={n}" for p, n in zip(node.plates, node.plate_shape, strict=True))
+    fix = surplus(node.name, node.plates, node.value_shape, shape)
     return (
         f"evidence on {node.name!r} has shape {shape}, but the node's plates ({plates or 'none'}) and "
-        f"event shape {node.event_shape} make {node.value_shape}"
+        f"event shape {node.event_shape} make {node.value_shape}{fix}"
     )
 
 
@@ -393,6 +401,23 @@ def warn_of_doubts(model: Model, name: str, found: Observed | None) -> None:
     doubt = _doubt(model, name, values) or _degrees(model[name], values)
     if doubt is not None:
         warnings.warn(f"evidence on {name!r}: {doubt}", EvidenceWarning, stacklevel=2)
+
+
+def warn_of_nothing(observed: Mapping[str, Observed]) -> None:
+    """Look whether the evidence has any values at all.
+
+    Warns
+    -----
+    EvidenceWarning
+        All of it are empty arrays, so that plates have size 0.
+    """
+    if observed and not any(found.value.size for found in observed.values()):
+        warnings.warn(
+            f"evidence on {', '.join(map(repr, observed))} is empty (size 0): nothing is learned from it, "
+            "and the answer is the prior",
+            EvidenceWarning,
+            stacklevel=2,
+        )
 
 
 # ---- private ------------------------------------------------------------------------------------

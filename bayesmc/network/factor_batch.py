@@ -24,7 +24,7 @@ from bayesmc.network.captured import captured
 from bayesmc.network.declaring import Constant
 from bayesmc.network.labels import Domain, domain_with_states
 from bayesmc.network.node import Declaration, Potential, bind, plain_states
-from bayesmc.shapes import Shape, as_shape, first_index, owned
+from bayesmc.shapes import Shape, as_shape, first_index, from_one, owned
 
 
 def variable_declaration(
@@ -251,6 +251,7 @@ def _flat(
             raise ModelError(
                 f"{what} is {array[row]} at row {row}, outside plate {plate!r}, whose positions are "
                 f"0..{sizes[plate] - 1}"
+                + from_one(int(array.min()), int(array.max()), sizes[plate])
             )
     return owned(np.ravel_multi_index(arrays, tuple(sizes[p] for p in plates)), np.intp)
 

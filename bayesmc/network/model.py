@@ -27,6 +27,7 @@ from bayesmc.errors import (
     UnsupportedError,
 )
 from bayesmc.network.calling import Aligner, RowAligner, call
+from bayesmc.network.clashing import data_around, sizes_beyond
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
@@ -358,11 +359,14 @@ def fit(declaration: Declaration, dist: Distribution, batch: Shape, plates: Shap
     if not broadcasts_to(dist.batch_shape, batch + plates):
         names = declaration.plates
         where = f"plates {names} of sizes {plates}" if names else "no plates"
-        raise ShapeError(
-            f"node {declaration.name!r}: {type(dist).__name__} has batch shape {dist.batch_shape}, "
-            f"which does not fit {batch + plates} (batch {batch} of the parents, {where}); "
+        around = data_around(declaration, plates, sizes_beyond(dist.batch_shape, batch + plates))
+        fix = around or (
             "declare the axes that are elements with plates=, the components of a vector on the last "
             "axis with a vector distribution"
+        )
+        raise ShapeError(
+            f"node {declaration.name!r}: {type(dist).__name__} has batch shape {dist.batch_shape}, "
+            f"which does not fit {batch + plates} (batch {batch} of the parents, {where}); {fix}"
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import ModelError
-from bayesmc.network.evidence import Observed, read_question, warn_of_doubts
+from bayesmc.network.evidence import Observed, read_question, warn_of_doubts, warn_of_nothing
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.model import Model
 from bayesmc.network.net import BayesNet
@@ -55,4 +55,5 @@ def pose(
     question = read_question(net, evidence, inputs)
     for name, found in question[2].items():
         warn_of_doubts(question[1], name, found)
+    warn_of_nothing(question[2])
     return Problem(*question)

@@ -15,6 +15,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, BroadcastError, ModelError
 from bayesmc.network.calling import call, to_mix
+from bayesmc.network.clashing import data_around, sizes_beyond
 from bayesmc.network.model import (
     CompiledNode,
     Model,
@@ -298,9 +299,11 @@ def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
         try:
             arrays.append(array if array.shape == full else np.broadcast_to(array, full))
         except ValueError:
+            beyond = sizes_beyond(array.shape[: array.ndim - own], lead)
+            around = data_around(node.declaration, node.plate_shape, beyond)
             raise BroadcastError(
                 f"{_what(node)}: a parameter of shape {array.shape} does not fit the batch and "
-                f"plates {lead}; write the function so that it broadcasts"
+                f"plates {lead}; {around or 'write the function so that it broadcasts'}"
             ) from None
     return _Signature(family, arrays)
 

@@ -17,7 +17,7 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from bayesmc.errors import PlateError, StateError
 from bayesmc.plates.gathered import Gathered
-from bayesmc.shapes import Shape, broadcast_shapes
+from bayesmc.shapes import Shape, broadcast_shapes, from_one
 
 
 class PlateArray(NDArrayOperatorsMixin):
@@ -395,7 +395,7 @@ def _as_index(key: Any, plate: str, size: int) -> PlateArray:
         if low < 0 or high >= size:
             raise IndexError(
                 f"index {low if low < 0 else high} is outside plate {plate!r}, whose positions are "
-                f"0..{size - 1}"
+                f"0..{size - 1}" + from_one(low, high, size)
             )
     array = array.astype(np.intp, copy=False) if is_known else array.within(size)
     if foreign is None:

@@ -211,6 +211,7 @@ def test_resample_draws_from_the_posterior() -> None:
     np.testing.assert_array_equal(drawn["s0"], again["s0"])
 
 
+@pytest.mark.filterwarnings("ignore:evidence on .* is empty:bayesmc.errors.EvidenceWarning")
 @pytest.mark.parametrize("keep", ["exact", "draws", "summaries"])
 def test_plates_of_size_zero(keep: str) -> None:
     """An empty plate has no elements and no influence; its figures are empty arrays."""

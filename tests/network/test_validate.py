@@ -360,6 +360,7 @@ def test_mixing_in_parameters_of_small_scale_is_caught():
         net.validate()
 
 
+@pytest.mark.filterwarnings("ignore:evidence on .* is empty:bayesmc.errors.EvidenceWarning")
 def test_mixing_is_looked_for_again_after_a_plate_of_size_one():
     """One data point cannot show mixing, so a net is not taken for good by it."""
 
