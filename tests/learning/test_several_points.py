@@ -127,6 +127,6 @@ def test_a_bar_says_what_is_climbed(capsys: pytest.CaptureFixture[str], monkeypa
     rows = {"y": [0.4, 1.3, -0.2, 2.0], "known": 0.0}
     bmc.fit(walk(), rows, inputs={"u": np.zeros(4)}, restarts=1, prior=True, progress=True)
     told = capsys.readouterr().err
-    assert "climb 1, at -" in told
+    assert "fit: 32 starts" in told
     bmc.fit(walk(), rows, inputs={"u": np.zeros(4)}, restarts=1, prior=True, progress=False)
     assert not capsys.readouterr().err
