@@ -364,21 +364,28 @@ def _smoothed(
     """A smoothed series, its answer kept in a file where one is wanted."""
     checkpoint = options.get("checkpoint")
     options = {n: v for n, v in options.items() if n != "checkpoint"}
-    if checkpoint is None:
-        own = seed_sequence(None) if seed is None else seed
-        return _smoothed_now(problem, engine, own, options)
-    opened = Opened("smooth", checkpoint, problem, engine is not None)
-    if engine is None and opened.header is not None and opened.header.get("named"):
-        engine = opened.engine
-    seed = opened.seed(None) if seed is None else seed
-    chosen = _smoother(problem, engine or opened.engine, options)[0]
-    asked = {n: options[n] for n in ("lag", "queries", "trajectories", "backward")}
-    file, answer = opened.begin(chosen, seed, None, asked)
-    if file is None:
-        return answer
-    with closing(file):
-        found = _smoothed_now(problem, engine, seed, options)
-        if not getattr(found, "interrupted", False) and found.steps == problem.steps:
+    file = None
+    if checkpoint is not None:
+        opened = Opened("smooth", checkpoint, problem, engine is not None)
+        if engine is None and opened.header is not None and opened.header.get("named"):
+            engine = opened.engine
+        seed = opened.seed(None) if seed is None else seed
+        chosen = _smoother(problem, engine or opened.engine, options)[0]
+        asked = {n: options[n] for n in ("lag", "queries", "trajectories", "backward")}
+        file, answer = opened.begin(chosen, seed, None, asked)
+        if file is None:
+            return answer
+    own = seed_sequence(None) if seed is None else seed
+    with nullcontext() if file is None else closing(file):
+        chosen, given = _smoother(problem, engine, options)
+        # called from here, since warnings count the calls up to the user's line
+        if engine is None and isinstance(chosen, ExpectationPropagation):
+            found = settled_or_kim(chosen, problem, options["queries"], options["progress"])
+        else:
+            with picks_told(problem.slices, problem.series):
+                found = chosen.smooth(problem, own, **given)
+        whole = found.steps == problem.steps and not getattr(found, "interrupted", False)
+        if file is not None and whole:
             file.finish(found)
     return found
 
@@ -408,19 +415,6 @@ def _smoother(
             f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
         )
     return chosen, given | {"lag": lag, "queries": queries, "progress": options["progress"]}
-
-
-def _smoothed_now(
-    problem: SeriesProblem,
-    engine: FilterEngine | None,
-    seed: np.random.SeedSequence,
-    options: dict[str, Any],
-) -> SeriesPosterior:
-    chosen, given = _smoother(problem, engine, options)
-    if engine is None and isinstance(chosen, ExpectationPropagation):
-        return settled_or_kim(chosen, problem, options["queries"], options["progress"])
-    with picks_told(problem.slices, problem.series):
-        return chosen.smooth(problem, seed, **given)
 
 
 def _from_belief(

@@ -27,6 +27,7 @@ from bayesmc.distributions import (
     MvNormal,
     Normal,
     Truncated,
+    Wishart,
 )
 from bayesmc.distributions.support import Support, interval
 from bayesmc.errors import BayesmcError
@@ -38,6 +39,7 @@ from bayesmc.kernels.vector_draws import (
     DirichletDraw,
     InverseWishartDraw,
     NormalDraw,
+    WishartDraw,
 )
 from bayesmc.passes.arithmetic import multiply
 from bayesmc.passes.features import LOG, LOG1M, Feature
@@ -177,6 +179,14 @@ class InverseWishartConditional(Conditional):
 
     def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
         return InverseWishart(*naturals)
+
+
+class WishartConditional(Conditional):
+    """``|x|^(df - d - 1)/2 exp(-tr(S x) / 2)``: Wishart, of the scale ``S^-1``."""
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        root = _root_of_inverse(naturals[1])
+        return Wishart(naturals[0], root @ np.matrix_transpose(root))
 
 
 def family_of_features(found: Mapping[Feature, Any], low: float, high: float) -> Conditional | None:
@@ -378,7 +388,7 @@ def _is_finite(numbers: np.ndarray) -> bool:
 
 def _one_program(
     family: Conditional, naturals: list[Expression]
-) -> NormalDraw | InverseWishartDraw | DirichletDraw | None:
+) -> NormalDraw | InverseWishartDraw | WishartDraw | DirichletDraw | None:
     """Natural parameters and draw as one."""
     if isinstance(family, NormalConditional):
         linear, square = naturals
@@ -387,4 +397,6 @@ def _one_program(
         return NormalDraw(*naturals)
     if isinstance(family, InverseWishartConditional):
         return InverseWishartDraw(*naturals)
+    if isinstance(family, WishartConditional):
+        return WishartDraw(*naturals)
     return DirichletDraw(*naturals) if isinstance(family, DirichletConditional) else None

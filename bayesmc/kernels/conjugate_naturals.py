@@ -3,11 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Dirichlet, InverseWishart, Multinomial, MvNormal
+from bayesmc.distributions import (
+    Categorical,
+    Dirichlet,
+    InverseWishart,
+    Multinomial,
+    MvNormal,
+    Wishart,
+)
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Expression,
@@ -25,6 +33,7 @@ from bayesmc.kernels.conjugate_families import (
     Form,
     InverseWishartConditional,
     MvNormalConditional,
+    WishartConditional,
     family_of_features,
     is_closed,
 )
@@ -66,18 +75,20 @@ _OF_VECTORS: dict[tuple[Any, str], str] = {
 }  # fmt: skip
 
 
+_OF_EVENTS: dict[Any, type[Conditional]] = {
+    Dirichlet: DirichletConditional, MvNormal: MvNormalConditional,
+    InverseWishart: InverseWishartConditional, Wishart: WishartConditional,
+}  # fmt: skip
+
+
 def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
     """The full conditional of some elements of a node, or in words why it has no closed form."""
     try:
         prior = prior_of(blanket)
     except TraceError as error:
         return str(error)
-    if prior.base.make is Dirichlet:
-        return _of_events(blanket, members, prior, DirichletConditional())
-    if prior.base.make is MvNormal:
-        return _of_events(blanket, members, prior, MvNormalConditional())
-    if prior.base.make is InverseWishart:
-        return _of_events(blanket, members, prior, InverseWishartConditional())
+    if prior.base.make in _OF_EVENTS:
+        return _of_events(blanket, members, prior, _OF_EVENTS[prior.base.make]())
     return _of_numbers(blanket, members, prior)
 
 
@@ -100,6 +111,9 @@ def why_not(blanket: Blanket, term: Term, prior: str) -> str:
     if len(read) > 1:
         return f"it enters {' and '.join(read)} of child {child!r}"
     (parameter,) = read
+    if prior == "Wishart" and parameter == "cov":
+        told = "a number times the inverse of one element of it"
+        return f"the cov of child {child!r} is not known to be {told}"
     if parameter not in forms:
         return f"it enters the {parameter} of {word} {child!r}"
     told = f"the {parameter} of child {child!r}"
@@ -285,13 +299,16 @@ def _event_added(
             raise TraceError("it has other features")
         return (found.coefficients.get(LOG, broadcast(ZERO, (of.count,))),), found.is_picked, []
     is_mean = isinstance(family, MvNormalConditional)
+    is_inverse = isinstance(family, WishartConditional)
     if child.sums is not None:
         try:
-            short = mean_by_label if is_mean else covariance_by_label
+            short = (
+                mean_by_label if is_mean else partial(covariance_by_label, is_inverse=is_inverse)
+            )
             return short(child.sums, of), False, [child.sums]
         except TraceError:
             (child,) = apart(blanket, child)
-    whole = mean_added if is_mean else covariance_added
+    whole = mean_added if is_mean else partial(covariance_added, is_inverse=is_inverse)
     return whole(child, of), False, []
 
 

@@ -25,6 +25,7 @@ from bayesmc.distributions import (
     Truncated,
     Uniform,
     Weibull,
+    Wishart,
 )
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
@@ -260,17 +261,19 @@ def naturals_of(blanket: Blanket, base: Family) -> list[Expression]:
     }
     if base.make is Dirichlet:
         return [add(parameters["concentration"].expression, -1.0)]
-    if base.make is InverseWishart:
+    if base.make in _MATRICES:
         df = broadcast(_known(blanket, base.parameters["df"]), blanket.node.plate_shape)
-        return [reshape(df, (count,)), parameters["scale"].expression]
+        scale = parameters["scale"]
+        if base.make is Wishart:
+            scale = _inverse(np.linalg.cholesky(scale))
+        return [reshape(df, (count,)), as_expression(scale)]
     if "scale_diag" in parameters:
         d = blanket.event_shape[-1]
         precision = parameters["scale_diag"][..., None] ** -2.0 * np.eye(d)
     else:
         factor = parameters.get("scale_tril")
         factor = np.linalg.cholesky(parameters["cov"]) if factor is None else factor
-        inverse = np.linalg.inv(factor)
-        precision = np.matmul(np.matrix_transpose(inverse), inverse)
+        precision = _inverse(factor)
     linear = np.matvec(precision, parameters["loc"])
     return [
         a.expression if isinstance(a, TracedArray) else as_expression(a)
@@ -308,6 +311,7 @@ def of_members(natural: Expression, blanket: Blanket, members: np.ndarray | None
 # ---- private ------------------------------------------------------------------------------------
 
 
+_MATRICES = (InverseWishart, Wishart)
 #: supports of families that any parameters leave as they are; Uniform's ends stand apart
 _SUPPORTS: dict[Any, tuple[float, float]] = {
     Normal: (-np.inf, np.inf),
@@ -336,13 +340,19 @@ def _is(bound: Expression, value: float) -> bool:
 def _as_family(result: Any) -> Family:
     if isinstance(result, Family):
         return result
-    if isinstance(result, InverseWishart):
+    if isinstance(result, _MATRICES):
         kept = {k: as_expression(getattr(result, k)) for k in ("df", "scale")}
-        return Family(InverseWishart, kept)
+        return Family(type(result), kept)
     try:
         return family_of(result)
     except TraceError:
         raise TraceError(f"a {type(result).__name__} prior has no conjugate pair") from None
+
+
+def _inverse(factor: Any) -> Any:
+    """The inverse of ``factor @ factor.T``."""
+    inverse = np.linalg.inv(factor)
+    return np.matmul(np.matrix_transpose(inverse), inverse)
 
 
 def _known(blanket: Blanket, value: Any) -> Expression:

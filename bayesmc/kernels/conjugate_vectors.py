@@ -1,8 +1,8 @@
 """What children add to the natural parameters of a vector that enters a mean, or of a covariance.
 
 A mean that is affine in a vector makes the log density a quadratic form in it; a covariance that is a
-multiple of a matrix makes it that of an inverse Wishart. Of children that are summed by label the same is
-said of the sums (``label_sums``).
+multiple of a matrix makes it that of an inverse Wishart, and one that is a multiple of a matrix's inverse
+that of a Wishart. Of children that are summed by label the same is said of the sums (``label_sums``).
 
 References
 ----------
@@ -20,15 +20,23 @@ import numpy as np
 from bayesmc.distributions import LogNormal, MvNormal, Normal
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
+    Call,
     Constant,
+    Elementwise,
     Expression,
+    Gather,
+    Pick,
     TracedArray,
     as_expression,
     broadcast,
     call,
     elementwise,
+    gather,
+    leaf,
+    ordered,
     pick,
     reduction,
+    replaced,
     reshape,
     substituted,
 )
@@ -40,10 +48,13 @@ from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import ONE, add, divide, is_all, multiply, subtract
 from bayesmc.passes.derivatives import tangent
 from bayesmc.passes.features import alone, statistics
-from bayesmc.passes.reads import element_read, same_along
+from bayesmc.passes.reads import element_read, matrix_function, same_along
 from bayesmc.passes.sufficient import precision_of, transposed
 from bayesmc.passes.totals import total
 from bayesmc.shapes import Shape
+
+#: an inverse, beside the nodes of a model: no node has such a name
+_INVERSE = "\0inverse"
 
 
 def mean_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
@@ -72,20 +83,27 @@ def mean_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
     return _of_vectors(slope, off, root, _Entries(at, of.count, child.mask))
 
 
-def covariance_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
-    """Degrees of freedom ``(count,)`` and scale ``(count, d, d)`` of a covariance.
+def covariance_added(
+    child: Child, of: Moving, is_inverse: bool = False
+) -> tuple[Expression, Expression]:
+    """Degrees of freedom ``(count,)`` and scatter ``(count, d, d)`` of a covariance.
+
+    Parameters
+    ----------
+    is_inverse : bool
+        Of a precision instead: its inverse is the covariance.
 
     Raises
     ------
     TraceError
-        It enters something else, or not as a multiple of itself.
+        It enters something else, or not as a multiple of itself, or of its inverse.
     """
     parameters, value = child.family.parameters, child.value
     if child.family.make is not MvNormal or child.read(of.name) != ["cov"]:
         raise TraceError("it enters no covariance")
     d = value.shape[-1]
     cov = broadcast(parameters["cov"], (*child.shape, d, d))
-    times, at = _multiples(cov, of)
+    times, at = (_inverse_multiples if is_inverse else _multiples)(cov, of.name, of.numbers)
     entries = _Entries(at, of.count, child.mask)
     off = subtract(value, broadcast(parameters["loc"], value.shape))
     scaled = divide(off, reshape(elementwise(np.sqrt, times), (*child.shape, 1)))
@@ -119,19 +137,22 @@ def mean_by_label(sums: LabelSums, of: Moving) -> tuple[Expression, Expression]:
     return entries.total(precision), entries.total(linear)
 
 
-def covariance_by_label(sums: LabelSums, of: Moving) -> tuple[Expression, Expression]:
+def covariance_by_label(
+    sums: LabelSums, of: Moving, is_inverse: bool = False
+) -> tuple[Expression, Expression]:
     """The same of a child that is summed by label, from its sums.
 
     Raises
     ------
     TraceError
-        It is not the covariance alone, or not a multiple of it.
+        It is not the covariance alone, or not a multiple of it, or of its inverse.
     """
     labels, d = _normal_labels(sums)
     cov = sums.family.parameters.get("cov")
     if cov is None or of.name in as_expression(sums.family.parameters["loc"]).leaves:
         raise TraceError("it is not the covariance alone")
-    times, at = _multiples(reshape(broadcast(cov, (*sums.shape, d, d)), (labels, d, d)), of)
+    cov = reshape(broadcast(cov, (*sums.shape, d, d)), (labels, d, d))
+    times, at = (_inverse_multiples if is_inverse else _multiples)(cov, of.name, of.numbers)
     scatter = divide(_about_loc(sums), reshape(times, (labels, 1, 1)))
     entries = _Entries(at, of.count, None)
     return entries.total(reshape(sums.column(0, 1), (labels,))), entries.total(scatter)
@@ -216,7 +237,7 @@ def _slopes(mean: Expression, of: Moving) -> tuple[Expression, Expression, Expre
     return _stacked(slopes), at, substituted(whole, {own.name: zero})
 
 
-def _multiples(cov: Expression, of: Moving) -> tuple[Expression, Expression]:
+def _multiples(cov: Expression, name: str, numbers: np.ndarray) -> tuple[Expression, Expression]:
     """By what covariances ``(*entries, d, d)`` multiply a matrix, and which one it is.
 
     Raises
@@ -225,19 +246,66 @@ def _multiples(cov: Expression, of: Moving) -> tuple[Expression, Expression]:
         They are no multiples of one element.
     """
     d = cov.shape[-1]
-    flat = np.arange(of.numbers.size).reshape(of.numbers.shape)
-    found = statistics(cov, of.name, flat)
+    flat = np.arange(numbers.size).reshape(numbers.shape)
+    found = statistics(cov, name, flat)
     if set(found.coefficients) != {1.0}:
         raise TraceError("it is no multiple")
     times = same_along(found.coefficients[1.0], [-1, -2])
-    whole, own = alone(cov, of.name, flat)
+    whole, own = alone(cov, name, flat)
     assert own is not None
     place = element_read(whole, own.name, flat % (d * d))
-    at = same_along(element_read(whole, own.name, of.numbers), [-1, -2])
+    at = same_along(element_read(whole, own.name, numbers), [-1, -2])
     in_place = np.broadcast_to(np.arange(d * d).reshape(d, d), place.shape)
     if times is None or at is None or place is not as_expression(in_place):
         raise TraceError("it is no multiple")
+    # features say nothing of what is added
+    if not _vanishes(affine(whole, [own.name]).offset):
+        raise TraceError("it is a multiple and more")
     return times, at
+
+
+def _inverse_multiples(
+    cov: Expression, name: str, numbers: np.ndarray
+) -> tuple[Expression, Expression]:
+    """By what covariances ``(*entries, d, d)`` multiply the inverse of a matrix, and which one it is.
+
+    Raises
+    ------
+    TraceError
+        They are no multiples of the inverse of one element.
+    """
+    inverses = [
+        n
+        for n in ordered(cov)
+        if isinstance(n, Call) and name in n.leaves and matrix_function(n) == "inv"
+    ]
+    if len(inverses) != 1:
+        raise TraceError("it is not inverted, or more than once")
+    (inverse,) = inverses
+    own = leaf(_INVERSE, inverse.shape)
+    outside = replaced(cov, {inverse: own})
+    if name in outside.leaves:
+        raise TraceError("it is no multiple of its inverse alone")
+    block = inverse.shape[-1] ** 2
+    which = np.arange(own.size).reshape(own.shape) // block
+    times, place = _multiples(outside, _INVERSE, which)
+    within, at = _multiples(inverse.operands[0], name, numbers)
+    within, at = (gather(reshape(e, (own.size // block,)), place) for e in (within, at))
+    return divide(times, within), at
+
+
+def _vanishes(node: Expression) -> bool:
+    """Whether an expression is zero whatever it reads, as far as this is seen."""
+    if not isinstance(node, Gather | Pick | Elementwise):
+        return is_all(node, 0)
+    inner = [_vanishes(a) for a in node.operands]
+    if isinstance(node, Gather):
+        return inner[0]
+    if isinstance(node, Elementwise) and node.function in (np.multiply, np.divide):
+        return inner[0] or (inner[1] and node.function is np.multiply)
+    choice = isinstance(node, Elementwise) and node.function is np.where
+    same = isinstance(node, Pick) or node.function in (np.add, np.subtract, np.negative)
+    return all(inner[1:] if choice else inner) if choice or same else False
 
 
 def _stacked(parts: list[Expression]) -> Expression:

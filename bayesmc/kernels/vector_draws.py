@@ -103,7 +103,7 @@ class InverseWishartDraw:
         self._half = SmallProgram([broadcast(half, self.shape)])
         self._normals = (*scale.shape[:-2], d * (d - 1) // 2)
         gamma, normal = leaf(_GAMMA, self.shape), leaf(_NORMAL, self._normals)
-        draw, angle, factor = _inverse_wishart_of(scale, gamma, normal)
+        draw, angle, factor = self._of(scale, _triangle(gamma, normal))
         self._program, self._factor = SmallProgram([draw, angle]), SmallProgram([factor])
 
     def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray:
@@ -112,7 +112,51 @@ class InverseWishartDraw:
         gamma = gammas(rng, half, (chains, *self.shape))
         values = {**values, _GAMMA: gamma, _NORMAL: normal}
         draw, angle = self._program(values)
-        return draw if _least_of(angle) >= _CLOSE else gram(self._factor(values)[0])[0]
+        return draw if _least_of(angle) >= _CLOSE else self._gram(self._factor(values)[0])
+
+    # ---- private -------------------------------------------------------------------------------
+
+    @staticmethod
+    def _of(scale: Expression, triangle: Expression) -> tuple[Expression, Expression, Expression]:
+        lower = constant(np.tril(np.ones(scale.shape[-2:])))
+        root = multiply(call(np.linalg.cholesky, [scale]), lower)
+        return _squared(call(np.matmul, [root, transposed(call(upper_inverse, [triangle]))]))
+
+    @staticmethod
+    def _gram(factor: np.ndarray) -> np.ndarray:
+        return gram(factor)[0]
+
+
+class WishartDraw(InverseWishartDraw):
+    """Draws from the Wishart distribution ``|x|^((df - d - 1)/2) exp(-tr(S x) / 2)``, given S.
+
+    If S is ``R R'`` and B is Bartlett's triangle, an upper one, the draw is ``M M'`` with ``M = R'^-1 B``:
+    the inverse of what an inverse Wishart draw of scale S is.
+
+    Parameters
+    ----------
+    df, scale : Expression, shapes (*plates) and (*plates, d, d)
+        The scale is S, the inverse of the one that ``Wishart`` has.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import as_expression
+    >>> from bayesmc.kernels.vector_draws import WishartDraw
+    >>> draw = WishartDraw(as_expression(12.0), as_expression(12.0 * np.eye(2)))
+    >>> draws = draw({}, np.random.default_rng(0), 10_000)
+    >>> bool(np.abs(draws.mean(axis=0) - np.eye(2)).max() < 0.05)  # df times the inverse of S
+    True
+    """
+
+    @staticmethod
+    def _of(scale: Expression, triangle: Expression) -> tuple[Expression, Expression, Expression]:
+        root = transposed(call(np.linalg.cholesky, [scale]))
+        return _squared(call(np.matmul, [call(upper_inverse, [root]), triangle]))
+
+    @staticmethod
+    def _gram(factor: np.ndarray) -> np.ndarray:
+        return gram(factor[..., ::-1, ::-1])[0][..., ::-1, ::-1]  # a lower triangle, reversed
 
 
 class DirichletDraw:
@@ -186,15 +230,11 @@ def _normal_of(precision: Expression, linear: Expression, noise: Expression) -> 
     return call(np.matvec, [root, white])
 
 
-def _inverse_wishart_of(
-    scale: Expression, gamma: Expression, normal: Expression
-) -> tuple[Expression, Expression, Expression]:
-    """A draw, the least square of the sine of an angle between its factor's rows, and the factor."""
-    d = scale.shape[-1]
-    batch = gamma.shape[:-1]
+def _triangle(gamma: Expression, normal: Expression) -> Expression:
+    """Bartlett's triangle, an upper one: from its diagonal, what is beside it, and zero."""
+    *batch, d = gamma.shape
     least = elementwise(np.maximum, multiply(2.0, gamma), _LEAST)
     parts = [elementwise(np.sqrt, least), normal, broadcast(constant(0.0), (*batch, 1))]
-    # the triangle, transposed an upper one: from its diagonal, what is beside it, and zero
     at, start = np.empty((*batch, d, d), dtype=np.intp), 0
     row, column = np.tril_indices(d, -1)
     places = [(np.arange(d), np.arange(d)), (column, row), (row, column)]
@@ -202,9 +242,11 @@ def _inverse_wishart_of(
         own = start + np.arange(part.size).reshape(part.shape)
         at[..., i, j] = own
         start += part.size
-    over = transposed(call(upper_inverse, [pick(parts, at)]))
-    lower = constant(np.tril(np.ones((d, d))))
-    factor = call(np.matmul, [multiply(call(np.linalg.cholesky, [scale]), lower), over])
+    return pick(parts, at)
+
+
+def _squared(factor: Expression) -> tuple[Expression, Expression, Expression]:
+    """A draw, the least square of the sine of an angle between its factor's rows, and the factor."""
     draw = product(np.matmul, factor, transposed(factor))  # symmetric to the last bit
     sines = divide(elementwise(np.square, _diagonal(factor)), _diagonal(draw))
     least = reduction(np.minimum, sines, range(len(sines.shape)))

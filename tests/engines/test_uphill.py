@@ -171,6 +171,56 @@ def test_the_frailty_model_is_found_from_far_away() -> None:
     assert log_of(target, moved).min() > -2_000
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_starts_that_paths_leave_far_off_begin_near_zero(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """Effects in the thousands fit each patient, and no path leads out of there in time."""
+    target, _, moved = begun("frailty", seed)
+    near = log_of(target, moved)
+
+    def kept(target: Any, density: Any, points: Any, logs: Any, *rest: Any) -> Any:
+        return points, logs, np.arange(points.shape[1])
+
+    monkeypatch.setattr(module, "_from_near", kept)
+    target, _, moved = begun("frailty", seed)
+    assert near.max() > log_of(target, moved).max() + 100.0
+    assert near.max() > -450.0  # the mode is at -307
+
+
+def test_paths_near_zero_into_a_neck_replace_no_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Effects of a flat scale: the density has no bound there, but starts are no worse than the posterior."""
+    net = bmc.BayesNet(plates={"i": 40})
+    net.add("a", bmc.Normal(0.0, 100.0))
+    net.add("s", bmc.Uniform(0.0, 100.0))
+    net.add("b", lambda a, s: bmc.Normal(a, s), plates="i")
+    net.add("y", lambda b: bmc.Poisson(np.exp(b)), plates="i")
+    evidence = {"y": RNG.poisson(np.exp(2.0 + 0.7 * RNG.normal(size=40)))}
+    target = target_of(pose_any(net, evidence, None, None))
+    asked: list[bool] = []
+    from_near = module._from_near
+
+    def watched(*args: Any) -> Any:
+        found = from_near(*args)
+        asked.append(found[0] is args[2])
+        return found
+
+    monkeypatch.setattr(module, "_from_near", watched)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        with marking_invalid(), np.errstate(all="ignore"):
+            moved = uphill(target, start_states(target, 8, rng), rng)
+        assert np.median(moved["s"]) > 0.3
+    assert asked
+    assert all(asked)
+
+
+def test_one_bad_path_leaves_the_others_good() -> None:
+    """A seed at which one row of eight ends where the model's own density is none."""
+    target, _, moved = begun("frailty", 3)
+    assert log_of(target, moved).min() > -2_000
+
+
 def test_a_good_start_stays_where_it_is() -> None:
     """And so does one in a funnel, whose mode is its neck."""
     net = bmc.BayesNet(plates={"i": 8})

@@ -86,6 +86,9 @@ SIDES: dict[tuple[str, str, str], tuple[Any, Callable[[Any], Any]]] = {
     ("covariance", "MvNormal", "cov"): (
         bmc.InverseWishart(4.5, COV), lambda x: bmc.MvNormal(np.ones(2), x)
     ),
+    ("precision", "MvNormal", "cov"): (
+        bmc.Wishart(4.5, COV), lambda x: bmc.MvNormal(np.ones(2), np.linalg.inv(x))
+    ),
 }  # fmt: skip
 
 #: priors that no pair above has: flat, truncated, other families
@@ -125,6 +128,7 @@ def _wrong(family: Conditional, times: float = 1.0) -> Change:
         "BetaConditional": lambda a, b: (a, b + 6.0 * times),
         "DirichletConditional": lambda a: (np.roll(a, 1, axis=-1),),
         "InverseWishartConditional": lambda df, scale: (df + 6.0 * times, scale),
+        "WishartConditional": lambda df, scale: (df + 6.0 * times, scale),
     }
     return faults[type(family).__name__]
 

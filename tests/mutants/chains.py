@@ -86,6 +86,15 @@ def covariance() -> bmc.BayesNet:
     return net
 
 
+def precision() -> bmc.BayesNet:
+    """A precision matrix, with hidden vectors and readings of them."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("x", bmc.Wishart(6.0, COV))
+    net.add("y", lambda x: bmc.MvNormal(np.zeros(2), np.linalg.inv(x)), plates="i")
+    net.add("z", lambda y: bmc.MvNormal(y, COV), plates="i")
+    return net
+
+
 def share() -> bmc.BayesNet:
     """A share, with successes among trials."""
     net = bmc.BayesNet()
@@ -317,6 +326,13 @@ MUTANTS = [
         (Edit("bayesmc.kernels.conjugate_terms:naturals_of",
               "return [reshape(df, (count,)), ", "return [add(reshape(df, (count,)), 2.0), "),),
         ranks(lambda: closed_form, covariance, 700),
+        "rank_test, 700 replications",
+    ),
+    Mutant(
+        "a Wishart's scale is taken for its inverse",
+        (Edit("bayesmc.kernels.conjugate_terms:naturals_of",
+              "if base.make is Wishart:", "if base.make is None:"),),
+        ranks(lambda: closed_form, precision, 700),
         "rank_test, 700 replications",
     ),
     Mutant(

@@ -5,6 +5,10 @@ steps of a quasi-Newton method do; but a mode itself is no start (that of a hier
 funnel), and starts ought to differ. So each start moves as little as it must: to the first point on its
 path that is nearly as good as where the path leads. One that is good enough stays where it is.
 
+Out of some regions no path leads: growth curves are flat where rates are in the thousands. So where starts
+had to move, paths from free numbers near zero are followed, too; they take the place of those that end far
+lower, if the data are not far likelier there.
+
 References
 ----------
 Zhang, Carpenter, Gelman and Vehtari (2022), Pathfinder, JMLR 23 (points on an optimiser's path as starts);
@@ -15,6 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesmc.engines.mcmc.climbing import row_logs
 from bayesmc.engines.mcmc.jointly import continuous, density_of
 from bayesmc.errors import BayesmcError
 from bayesmc.structure.target import Target, Values, target_of
@@ -30,6 +35,9 @@ _FIRST, _FARTHEST = 0.5, 5.0
 _EACH, _BESIDES = 2.0, 20.0
 #: how many times more, below the best end, loses a start altogether
 _LOST = 5.0
+#: how far from zero free numbers of other starts are, at most; what some steps must gain where paths of
+#: starts that may be lost are followed further
+_NEAR, _LITTLE = np.array([0.5, 2.0, 8.0]), 1.0
 #: free numbers beyond which the paths of all starts take longer than they save
 _LARGEST = 2000
 
@@ -59,26 +67,40 @@ def uphill(target: Target, values: Values, rng: np.random.Generator) -> Values:
     if not 0 < density.size <= _LARGEST:
         return values
     hidden = {n: v for n, v in values.items() if n in target.chain}
+    inside = {*hidden, *target.links}
     rows = len(next(iter(hidden.values())))
     free = np.array(density.unconstrain(values), dtype=float)
     margin = _BESIDES + _EACH * density.size
     points, logs = _paths(density, free, values, margin)
     ends = logs.max(axis=0)
+    if np.isfinite(ends).all() and not (logs[0] < ends - margin).any():
+        if (ends >= ends.max() - _LOST * margin).all():
+            return values
+    of = np.arange(rows)
+    try:
+        points, logs, of = _from_near(target, density, points, logs, values, margin, rng)
+    except BayesmcError:  # where parameters are out of range, paths near zero are none
+        pass
+    ends = logs.max(axis=0)
     enough = (logs >= ends - margin).argmax(axis=0)
     good = np.flatnonzero(ends >= ends.max() - _LOST * margin)
-    if not np.isfinite(ends[good]).all() or (len(good) == rows and not enough.any()):
+    if not np.isfinite(ends[good]).all():
         return values
     source = np.arange(rows)
     lost = np.setdiff1d(source, good)
     source[lost] = rng.choice(good, len(lost))
-    moved = {**values, **{n: v[source] for n, v in hidden.items()}}
+    moved = {**values, **{n: v[of[source]] for n, v in hidden.items()}}
     moved.update(density.constrain(points[enough[source], source], moved))
     target.refresh(moved, target.chain)
     try:  # the model's own functions have the last word
         log = np.broadcast_to(target.log_density(moved), (rows,))
     except BayesmcError:
         return values
-    return moved if np.isfinite(log).all() else values
+    fine = np.isfinite(log)
+    if fine.all() or not fine.any():
+        return moved if fine.all() else values
+    source = np.where(fine, np.arange(rows), rng.choice(np.flatnonzero(fine), rows))
+    return {n: v[source] if n in inside else v for n, v in moved.items()}
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -91,12 +113,67 @@ def _density(target: Target) -> UnconstrainedDensity:
     return unconstrained_density(target)
 
 
+def _from_near(
+    target: Target,
+    density: UnconstrainedDensity,
+    points: np.ndarray,
+    logs: np.ndarray,
+    values: Values,
+    margin: float,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The paths, those that are lost replaced by such as begin with free numbers near zero.
+
+    The third array tells which row's other values each goes with.
+    """
+    rows = points.shape[1]
+    of, wide = np.arange(rows), np.repeat(np.arange(rows), len(_NEAR))
+    held = {n: v[wide] if n in target.chain else v for n, v in values.items()}
+    target.refresh(held, target.chain)
+    spread = np.tile(_NEAR, rows)[:, None]
+    near = spread * rng.spawn(1)[0].uniform(-1.0, 1.0, (len(wide), density.size))
+    others, other_logs = _paths(density, near, held, margin)
+    further, far = _paths(density, points[-1], values, _LITTLE)
+    far, reached = (np.where(np.isnan(a), -np.inf, a)[-1] for a in (far, other_logs))
+    seen, seen_near = (
+        _of_data(target, density, further, values),
+        _of_data(target, density, others, held),
+    )
+    lower = (far[:, None] + margin < reached) & (seen[:, None] < seen_near + margin)
+    lost = np.flatnonzero(lower.any(axis=1))
+    if not len(lost):
+        return points, logs, of
+    steps = max(len(points), len(others))
+    points, logs, others, other_logs = (
+        np.concatenate([a, np.repeat(a[-1:], steps - len(a), axis=0)])
+        for a in (points, logs, others, other_logs)
+    )
+    for row in lost:
+        by = rng.choice(np.flatnonzero(lower[row]))
+        points[:, row], logs[:, row], of[row] = others[:, by], other_logs[:, by], wide[by]
+    return points, logs, of
+
+
+def _of_data(
+    target: Target, density: UnconstrainedDensity, points: np.ndarray, values: Values
+) -> np.ndarray:
+    """Log densities of the data where paths end, shape (rows,)."""
+    rows = points.shape[1]
+    state = {**values, **density.constrain(points[-1], values)}
+    target.refresh(state, target.chain)
+    found = np.zeros(rows)
+    for term in target.terms.values():
+        if term.name not in target.chain:
+            found += row_logs(term, state, rows).reshape(rows, -1).sum(axis=1)
+    return found
+
+
 def _paths(
-    density: UnconstrainedDensity, start: np.ndarray, values: Values, margin: float
+    density: UnconstrainedDensity, start: np.ndarray, values: Values, least: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points of L-BFGS paths of all rows, and their log densities, shapes (step, row, size), (step, row).
 
-    They end where some steps gain less than ``margin``: what is left is a chain's affair, and the way into a
+    They end where some steps gain less than ``least``: what is left is a chain's affair, and the way into a
     funnel's neck, too.
     """
     u, (log, slope) = start, density.with_gradient(start, values)
@@ -128,7 +205,7 @@ def _paths(
         u, log, slope = best, new_log, new_slope
         points.append(u)
         logs.append(log)
-        if len(logs) > _SOME and not (log - logs[-_SOME - 1] > margin).any():
+        if len(logs) > _SOME and not (log - logs[-_SOME - 1] > least).any():
             break
     return np.stack(points), np.stack(logs)
 
