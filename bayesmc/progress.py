@@ -16,14 +16,14 @@ class Progress:
 
     Parameters
     ----------
-    total : int
-        Units of work.
+    total : int or None
+        Units of work; None where nobody knows.
     label : str
     show : bool or None
         True: always; False: never; None: where the error stream is a terminal.
     """
 
-    def __init__(self, total: int, label: str, show: bool | None = None) -> None:
+    def __init__(self, total: int | None, label: str, show: bool | None = None) -> None:
         self.total = total
         self.label = label
         self.done = 0
@@ -42,6 +42,12 @@ class Progress:
             self._bar = tqdm(total=self.total, initial=self.done, desc=self.label, leave=False)
         elif self._bar is not None:
             self._bar.update(units)
+
+    def tell(self, label: str) -> None:
+        """Say something else in front of the bar from now on."""
+        self.label = label
+        if self._bar is not None:
+            self._bar.set_description(label, refresh=False)
 
     def __enter__(self) -> Progress:
         return self

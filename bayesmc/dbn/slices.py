@@ -7,7 +7,6 @@ values for the second to be evaluated.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayesmc.dbn.by_chance import lags_by_chance
+from bayesmc.dbn.names import far_back, meant
 from bayesmc.dbn.travelling import Travelling
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
@@ -24,7 +25,6 @@ from bayesmc.errors import (
     ModelError,
     ParameterError,
     UnknownNodeError,
-    did_you_mean,
 )
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
@@ -44,13 +44,6 @@ TIME = "t"
 _CLOCK = {
     name: Declaration(name, "input", (), (), event_shape=()) for name in (TIME, TIME + PREVIOUS)
 }
-
-#: names by which one may try to look further back: x_prev2, x_prev_prev, x_2prev, x_lag2
-_FAR_BACK = re.compile(r"(.+?)_?(?:prev((_?prev)+|_?\d+(_prev)?)|\d+_?prev|lag_?(?!1$)\d+)")
-#: other ways to write that of the slice before
-_TURNED = re.compile(r"(?:prev|previous|last)_(.+)|(.+?)_(?:t_?1|tm1|previous|last|lag_?1?)")
-#: names of nodes of the unrolled net
-_UNROLLED = re.compile(r"(.+)\[\d+\]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,26 +83,7 @@ class Template:
 
     def unknown(self, name: str) -> str:
         """That the template has no such node, and which one may be meant."""
-        slice_ = _UNROLLED.fullmatch(name)
-        if slice_ and slice_[1] in self.later:
-            return f"rows go under the name {slice_[1]!r}, time first: row k belongs to slice k"
-        before = [n + PREVIOUS for n in self.later if n not in self.static]
-        turned = _TURNED.fullmatch(name)
-        named = (turned[1] or turned[2]) + PREVIOUS if turned else name
-        hint = did_you_mean(named if named in before else name, [*self.later, *before, TIME])
-        return f"the template has no node {name!r}{hint}"
-
-    def further_back(self, name: str) -> str | None:
-        """How to look more than one slice back, if that is what a name is meant for."""
-        far = _FAR_BACK.fullmatch(name)
-        if far is None or far[1] not in self.later or far[1] in self.static:
-            return None
-        own, lag = far[1], f"{far[1]}_lag"
-        how = f"dbn.add({lag!r}, lambda {own}{PREVIOUS}: {own}{PREVIOUS}, initial=...)"
-        return (
-            f"functions look one slice back. Carry what is further back on by a lag node, {how}, and read "
-            f'{lag + PREVIOUS!r} (docs/time.md, "Further back than one slice")'
-        )
+        return meant(name, self.later, self.static)
 
     def check(self) -> None:
         """Refuse parents that are not there, and what has no slice before it in slice 0.
@@ -125,7 +99,7 @@ class Template:
                 stem = parent.removesuffix(PREVIOUS)
                 previous = stem != parent
                 if stem not in known or (previous and stem == TIME):
-                    far = self.further_back(parent)
+                    far = far_back(parent, self.later, self.static)
                     why = (
                         f", but {far}"
                         if far is not None
@@ -263,6 +237,8 @@ class SliceStore:
         self.template = template
         #: values that computed nodes shall have
         self._domains: dict[str, Domain] = {}
+        #: for later slices, of nodes that slice 0 draws and functions compute
+        self._lags: dict[str, Declaration] = {}
         self._two: ModelStore | None = None
         self._one: ModelStore | None = None
         self._found: dict[tuple[int, int], Slices] = {}
@@ -280,6 +256,8 @@ class SliceStore:
             key = (id(first), id(later))
             if key in self._found:
                 return self._found[key]
+            if self._find_lags(first, later):
+                continue
             domains = _computed_domains(self.template, first, later)
             domains |= _counts_that_vary(self.template, first, later)
             if not domains:
@@ -291,7 +269,7 @@ class SliceStore:
         _check_alike(self.template, first, later)
         while len(self._found) >= 8:
             self._found.pop(next(iter(self._found)))
-        found = self._found[key] = Slices(self.template, first, later)
+        found = self._found[key] = Slices(self._drawn(), first, later)
         return found
 
     def probe(self, sizes: Mapping[str, int | None]) -> Slices:
@@ -318,6 +296,22 @@ class SliceStore:
         node = self.probe(sizes).later[name].record()
         return replace(node, kind="static") if name in self.template.static else node
 
+    def _find_lags(self, first: Model, later: Model) -> bool:
+        """Whether there are nodes, drawn in slice 0 and computed later, that must be compiled again."""
+        known, drawn = self.template.first, first.nodes
+        lags = [n for n in known if drawn[n].is_stochastic and not later[n].is_stochastic]
+        if lags:
+            own = {n: self.template.later[n] for n in lags}
+            self._lags.update(lags_by_chance(own, first, later))
+            self._one = self._two = None
+        return bool(lags)
+
+    def _drawn(self) -> Template:
+        """The template with every node drawn in all slices, or in none."""
+        if not self._lags:
+            return self.template
+        return replace(self.template, later={**self.template.later, **self._lags})
+
     def _settle(self, domains: Mapping[str, Domain]) -> None:
         """Compile again, with the values that computed nodes have in any slice."""
         self._domains.update(domains)
@@ -325,8 +319,8 @@ class SliceStore:
 
     def _stores(self) -> tuple[ModelStore, ModelStore]:
         if self._one is None or self._two is None:
-            template = self.template
-            template.check()
+            self.template.check()
+            template = self._drawn()
             if self._domains:
 
                 def settled(given: Mapping[str, Declaration]) -> dict[str, Declaration]:
@@ -355,6 +349,8 @@ class SliceStore:
 _OPEN = 3
 #: times that models are compiled to find all values of computed nodes
 _ROUNDS = 6
+
+
 #: of a computed node whose values are not counted
 _UNCOUNTED = Domain(0)
 
@@ -380,16 +376,6 @@ def _computed_domains(template: Template, first: Model, later: Model) -> dict[st
     return found
 
 
-def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
-    """Values of a computed node: of its domain, or of a constant."""
-    if node.domain is not None:
-        return node.domain.numbers
-    if node.parents or node.event_shape:
-        return None
-    value = np.asarray(model.probe[node.name])
-    return np.unique(value) if value.dtype.kind in "biu" else None
-
-
 def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[str, Domain]:
     """Drawn nodes whose values are as many as an input or the time says: no finite set serves all slices."""
     found = {}
@@ -405,6 +391,16 @@ def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[st
             if moved is not None and moved != node.support:
                 found[name] = _UNCOUNTED
     return found
+
+
+def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
+    """Values of a computed node: of its domain, or of a constant."""
+    if node.domain is not None:
+        return node.domain.numbers
+    if node.parents or node.event_shape:
+        return None
+    value = np.asarray(model.probe[node.name])
+    return np.unique(value) if value.dtype.kind in "biu" else None
 
 
 def _support_further(model: Model, name: str, parents: set[str]) -> Support | None:

@@ -86,7 +86,9 @@ class ForestBlock(Kernel):
         members = members_of(target, self.names)
         edges = list(dict.fromkeys(m for m in members.values() if len(m) > 1))
         colour = _two_colours(self.names, edges)
-        edges = [(a, b) if colour[a] < colour[b] else (b, a) for a, b in edges]
+        edges = list(  # two factors may name one pair in either order
+            dict.fromkeys((a, b) if colour[a] < colour[b] else (b, a) for a, b in edges)
+        )
         self.forest = Forest(len(names), np.array([(place[a], place[b]) for a, b in edges]))
         self.candidates: Values = {}
         for name, card, dtype in zip(names, self.cards, self.dtypes, strict=True):

@@ -10,6 +10,7 @@ import numpy as np
 from bayesmc.errors import UnsupportedError
 from bayesmc.learning.fitted import agreeing
 from bayesmc.learning.objectives import Objective
+from bayesmc.progress import Progress
 
 #: climbs that are made at least, and at most, where nobody says how many
 _FEWEST, _MOST = 3, 8
@@ -66,6 +67,7 @@ def maximum(
     tolerance: float,
     max_iterations: int,
     climbs: int | None = None,
+    bar: Progress | None = None,
 ) -> Maximum:
     """The highest of the maxima that climbs from the best starts find.
 
@@ -74,15 +76,21 @@ def maximum(
     starts : ndarray, shape (starts, size)
     climbs : int, optional
         How many; None goes on until two have ended at the highest value, within bounds.
+    bar : Progress, optional
+        Told of every start, climb and step.
 
     Raises
     ------
     UnsupportedError
         The evidence cannot be told at any start.
     """
+    bar = Progress(None, "fit", False) if bar is None else bar
     costly = getattr(objective, "is_costly", False)
     starts = starts[: max(_TRIED_OF_COSTLY, climbs or 0)] if costly else starts
-    heights = np.array([objective.value(u) for u in starts])
+    several = getattr(objective, "values", None)
+    bar.tell(f"fit: {len(starts)} starts")
+    heights = several(starts) if several else np.array([objective.value(u) for u in starts])
+    bar.advance()
     if not np.isfinite(heights).any():
         refused = getattr(objective, "refused", None)
         why = f": {refused}" if refused is not None else ""
@@ -96,7 +104,10 @@ def maximum(
     for at in order[: climbs or _MOST]:
         if climbs is None and len(ended) >= _FEWEST and agreeing([c.value for c in ended]) > 1:
             break
-        ended.append(_climbed(objective, starts[at], heights[at], tolerance, max_iterations))
+        bar.tell(f"fit: climb {len(ended) + 1}")
+        ended.append(_climbed(objective, starts[at], heights[at], tolerance, max_iterations, bar))
+    bar.tell("fit: curvature")
+    bar.advance()
     best = max(ended, key=lambda climb: climb.value)
     _settle(objective, best.u)
     value = objective.value(best.u)
@@ -170,15 +181,22 @@ class _Climb(NamedTuple):
 
 
 def _climbed(
-    objective: Objective, start: np.ndarray, height: float, tolerance: float, most: int
+    objective: Objective,
+    start: np.ndarray,
+    height: float,
+    tolerance: float,
+    most: int,
+    bar: Progress,
 ) -> _Climb:
     """One climb by quasi-Newton steps; what is found at its end may let it go on."""
     from scipy.optimize import minimize
 
-    u, history, steps = start, [height], 0
+    u, history, steps, label = start, [height], 0, bar.label
 
     def note(at: np.ndarray) -> None:
         history.append(objective.value(at))
+        bar.tell(f"{label}, at {history[-1]:.4f}")
+        bar.advance()
 
     for k in range(_ROUNDS):
         settled = _settle(objective, u)

@@ -26,10 +26,11 @@ from bayesmc.learning.climbing import Maximum, maximum, told_part
 from bayesmc.learning.fitted import Fit, lonely
 from bayesmc.learning.objectives import Density, Evidence, Objective, hidden_numbers
 from bayesmc.learning.series_evidence import of_template
-from bayesmc.learning.tables import fit_tables
+from bayesmc.learning.tables import Climb, fit_tables
 from bayesmc.learning.unknowns import Unknowns
 from bayesmc.network import BayesNet, Problem, pose
 from bayesmc.network.columns import columns_of
+from bayesmc.progress import Progress
 from bayesmc.randomness import seed_sequence
 from bayesmc.structure.unconstrained import without_volume
 
@@ -51,6 +52,7 @@ def fit(
     max_iterations: int = 1000,
     restarts: int | None = None,
     rng: Any = 0,
+    progress: bool | None = None,
 ) -> Fit:
     """Parameters of a net or template by maximum likelihood, or the mode of their posterior.
 
@@ -88,6 +90,8 @@ def fit(
         on until two end at the same height, three at least and eight at most; EM begins once.
     rng : seed, SeedSequence, Generator or None
         For starts.
+    progress : bool, optional
+        Show a bar after a second; None where the error stream is a terminal.
 
     Returns
     -------
@@ -147,13 +151,14 @@ def fit(
                 "one after the "
                 "other (learn=)"
             )
-        again = restarts or 1, np.random.default_rng(seed_sequence(rng))
-        return fit_tables(
-            net, data, inputs, tables, counts, start, tolerance, max_iterations, *again
-        )
+        chance = np.random.default_rng(seed_sequence(rng))
+        with Progress(None, "fit", progress) as bar:
+            climb = Climb(tolerance, max_iterations, restarts or 1, chance, bar)
+            return fit_tables(net, data, inputs, tables, counts, start, climb)
     objective, unknowns = _objective(net, data, inputs, chosen, prior, engine)
     starts = _starts(unknowns, start, np.random.default_rng(seed_sequence(rng)), restarts)
-    found = maximum(objective, starts, tolerance, max_iterations, restarts)
+    with Progress(None, "fit", progress) as bar:
+        found = maximum(objective, starts, tolerance, max_iterations, restarts, bar)
     return _fitted(net, objective, unknowns, found, prior)
 
 

@@ -113,6 +113,13 @@ class Density:
         return np.concatenate([at[name] for name in self.density.names])
 
 
+def steps_around(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points below and above a point along each number in turn, shape ``(2 * size, size)``, and the steps."""
+    steps = _STEP * np.maximum(1.0, np.abs(u))
+    signs = np.stack([-np.eye(len(u)), np.eye(len(u))], axis=1).reshape(-1, len(u))
+    return u + signs * steps, steps
+
+
 def differences(function: Callable[[np.ndarray], float], u: np.ndarray) -> np.ndarray:
     """Central differences; one-sided where only one side can be told."""
     found = np.zeros(len(u))

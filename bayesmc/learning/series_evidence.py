@@ -13,14 +13,21 @@ from bayesmc.dbn import UNCOMPARED, DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.errors import BayesmcError, UnsupportedError
-from bayesmc.learning.objectives import Evidence
+from bayesmc.learning.objectives import Evidence, steps_around
+from bayesmc.learning.several_points import SeveralPoints
 from bayesmc.learning.unknowns import Unknowns
+
+#: points whose evidences and slopes are remembered
+_REMEMBERED = 8
+#: rows beyond which points are no longer next to free, so that slopes are only asked where they are wanted
+_LONG = 2000
 
 
 class SeriesEvidence(Evidence):
     """What a filter says of a series, given static nodes.
 
-    A grid that is found for one point is kept for those near it: finding one takes most of the time, and
+    A point and those around it, whose differences are the slope there, are asked in one pass where the filter
+    can. A grid that is found for one point is kept for those near it: finding one takes most of the time, and
     grids that change from point to point make differences rough.
     """
 
@@ -36,20 +43,94 @@ class SeriesEvidence(Evidence):
         super().__init__(unknowns, self._log_evidence, with_prior)
         self.engine, self.dbn, self.data, self.inputs = engine, dbn, data, inputs
         self._grid: Any = None
+        self._together: SeveralPoints | None = None
+        self._known: dict[bytes, tuple[float, np.ndarray | None]] = {}
         #: whether something is found anew for points that lie far from each other
         self.is_costly = isinstance(engine, GridFilter)
+
+    def value(self, u: np.ndarray) -> float:
+        key = u.tobytes()
+        together = self._together
+        if key not in self._known and together is not None and together.problem.steps > _LONG:
+            self._remember(key, (super().value(u), None))
+        elif key not in self._known:
+            around = self._around(u)
+            self._remember(key, around if around is not None else (self._alone(u), None))
+        return self._known[key][0]
+
+    def gradient(self, u: np.ndarray) -> np.ndarray:
+        key = u.tobytes()
+        if self._known.get(key, (0.0, None))[1] is None:
+            around = self._around(u)
+            value = self._known[key][0] if key in self._known else self._alone(u)
+            self._remember(key, around if around is not None else (value, super().gradient(u)))
+        slope = self._known[key][1]
+        assert slope is not None
+        return slope
+
+    def values(self, us: np.ndarray) -> np.ndarray:
+        """At several points."""
+        found = self._at_once(us)
+        return (
+            np.array([super(SeriesEvidence, self).value(u) for u in us]) if found is None else found
+        )
 
     def settle(self, u: np.ndarray) -> bool:
         """Keep for points near ``u`` what is found there; False where nothing is, and nothing changes."""
         if not isinstance(self.engine, GridFilter):
             return False
         self._grid = None  # so that this point's is sought
+        self._known.clear()
         try:
             with np.errstate(all="ignore"):
                 self._grid = self.engine.grid_for(self._posed(self.unknowns.values(u)))
         except BayesmcError as error:
             self.refused = error
         return self._grid is not None
+
+    # ---- private ------------------------------------------------------------------------------
+
+    def _alone(self, u: np.ndarray) -> float:
+        """By a pass of its own, where points side by side could not be asked."""
+        found = super().value(u)
+        if self._together is not None and np.isfinite(found):
+            self._together.missed()
+        return found
+
+    def _remember(self, key: bytes, found: tuple[float, np.ndarray | None]) -> None:
+        self._known.pop(key, None)
+        while len(self._known) >= _REMEMBERED:
+            self._known.pop(next(iter(self._known)))
+        self._known[key] = found
+
+    def _around(self, u: np.ndarray) -> tuple[float, np.ndarray] | None:
+        """The value at a point and the slope there, by one pass; None where it takes several."""
+        points, steps = steps_around(u)
+        found = self._at_once(np.vstack([u, points]))
+        if found is None or not np.isfinite(found).all():
+            return None
+        low, high = found[1:].reshape(-1, 2).T
+        return float(found[0]), (high - low) / (2 * steps)
+
+    def _at_once(self, us: np.ndarray) -> np.ndarray | None:
+        """Values at several points by one pass, held against single ones until they have agreed."""
+        try:
+            points = [self.unknowns.values(u) for u in us]
+            if self._together is None:
+                self._together = SeveralPoints(self._posed(points[0]), self.engine)
+        except BayesmcError:
+            return None
+        found = self._together.log_evidences(points)
+        if found is None:
+            return None
+        if self.with_prior:
+            found = found + np.array([self.unknowns.log_prior(u) for u in us])
+        found = np.where(np.isfinite(found), found, -np.inf)
+        if not self._together.is_trusted:
+            for k in {0, len(us) - 1}:
+                if not self._together.holds(found[k], super().value(us[k])):
+                    return None
+        return found
 
     def _posed(self, values: Mapping[str, np.ndarray]) -> SeriesProblem:
         return pose_series(self.dbn, {**self.data, **values}, self.inputs)
@@ -61,7 +142,9 @@ class SeriesEvidence(Evidence):
             self.engine.taking(asked, self._grid)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # at parameters that do not fit, filters say so
-            found = self.engine.filter(asked, np.random.SeedSequence(0)).log_marginal_likelihood
+            found = self.engine.filter(
+                asked, np.random.SeedSequence(0), progress=False
+            ).log_marginal_likelihood
         return float(np.sum(found))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,11 +18,22 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.learning.cases import MISSING, Cases
-from bayesmc.learning.expectation_maximisation import Learned, Tables, maximised
+from bayesmc.learning.expectation_maximisation import Expected, Learned, Tables, maximised
 from bayesmc.learning.fitted import Fit, lonely
 from bayesmc.learning.series_counts import SeriesCounts
 from bayesmc.network import BayesNet, CompiledNode, Model
 from bayesmc.network.columns import array_of
+from bayesmc.progress import Progress
+
+
+class Climb(NamedTuple):
+    """How far and how often expectation-maximisation goes, see ``fit``; ``bar`` is told of its steps."""
+
+    tolerance: float
+    most: int
+    restarts: int
+    rng: np.random.Generator
+    bar: Progress
 
 
 def fit_tables(
@@ -32,17 +43,14 @@ def fit_tables(
     learned: Sequence[str],
     counts: Any,
     start: Mapping[str, Any],
-    tolerance: float,
-    most: int,
-    *again: Any,
+    climb: Climb,
 ) -> Fit:
     """See ``fit``; ``again`` is how often EM begins, and a generator."""
     if isinstance(net, DynamicBayesNet):
         series = SeriesCounts(net, data, inputs, learned)
         begin = {n: _begin(n, t, start) for n, t in series.tables().items()}
         _check_names(start, begin)
-        begins = _begins(begin, start, *again)
-        found, ends = _highest(series.expected, begins, counts, tolerance, most)
+        found, ends = _highest(series.expected, begin, start, counts, climb)
         return _fit(series.filled(found.tables), found, counts, ends)
     if inputs:
         raise UnsupportedError("fit: tables are learned of nets without inputs; leave inputs= out")
@@ -75,8 +83,7 @@ def fit_tables(
     def expected(at: Mapping[str, np.ndarray]) -> tuple[float, Mapping[str, np.ndarray]]:
         return cases.expected({**known, **at})
 
-    begins = _begins(begin, start, *again)
-    found, ends = _highest(expected, begins, counts, tolerance, most)
+    found, ends = _highest(expected, begin, start, counts, climb)
     declarations = {
         n: replace(d, probs=found.tables[n]) if n in found.tables else d
         for n, d in net.declarations.items()
@@ -86,6 +93,18 @@ def fit_tables(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _told_of(bar: Progress, expected: Expected) -> Expected:
+    """Expected counts, of each of which a bar is told."""
+
+    def counted(at: Mapping[str, np.ndarray]) -> tuple[float, Mapping[str, np.ndarray]]:
+        found = expected(at)
+        bar.tell(f"fit: log likelihood {found[0]:.4f}")
+        bar.advance()
+        return found
+
+    return counted
 
 
 def _begins(
@@ -103,11 +122,12 @@ def _begins(
 
 
 def _highest(
-    expected: Any, begins: Sequence[Tables], counts: Any, tolerance: float, most: int
+    expected: Expected, begin: Tables, start: Mapping[str, Any], counts: Any, climb: Climb
 ) -> tuple[Learned, np.ndarray]:
     """The highest end of EM, and all, highest first."""
-    added = _dirichlet(begins[0], counts)
-    found = [maximised(expected, at, added, tolerance, most) for at in begins]
+    added, told = _dirichlet(begin, counts), _told_of(climb.bar, expected)
+    begins = _begins(begin, start, climb.restarts, climb.rng)
+    found = [maximised(told, at, added, climb.tolerance, climb.most) for at in begins]
     best = max(found, key=lambda each: each.objective)
     return best, np.sort([each.objective for each in found])[::-1]
 

@@ -16,7 +16,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
-from bayesmc.network.node import is_link
+from bayesmc.network.node import is_link, way_out_of_lag
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape
 
@@ -360,6 +360,9 @@ def refuse_noiseless(model: Model, names: Iterable[str], who: str) -> str | None
                 f"(net.add('{name}_seen', lambda {name}: Normal({name}, scale))), or one of its parents; "
                 "where the model is linear-Gaussian, Exact() and Kalman filters take it as it is"
             )
+        lag = way_out_of_lag(model[name].declaration)
+        if model[name].noiseless and lag is not None:
+            return f"{who} evaluates the density of {name!r}, which has none: {lag}"
         if model[name].noiseless:
             return (
                 f"{who} evaluates the density of {name!r}, which has none: it is without noise (a scale of "

@@ -19,6 +19,8 @@ from bayesmc.shapes import Shape, first_index
 
 #: what a function without noise is known by
 _MARK = "bayesmc_computes"
+#: the same of a node that is drawn at first and computed from then on
+_LAG = "bayesmc_lags"
 
 
 @dataclass(frozen=True)
@@ -344,6 +346,24 @@ def without_noise(declaration: Declaration, rank: int) -> Declaration:
 def is_link(declaration: Declaration) -> bool:
     """Whether a node was computed before ``without_noise``."""
     return _MARK in getattr(declaration.function, "__dict__", {})
+
+
+def as_lag(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Mark the function of a node that is drawn in slice 0, and computed from then on."""
+    function.__dict__[_LAG] = True
+    return function
+
+
+def way_out_of_lag(declaration: Declaration) -> str | None:
+    """How a node that is drawn in slice 0 and computed later is declared as one that is computed in all."""
+    if _LAG not in getattr(declaration.function, "__dict__", {}):
+        return None
+    name = declaration.name.partition("[")[0]
+    return (
+        f"{name!r} is drawn in slice 0 and computed later; give what stood before slice 0 a node of its own, "
+        f"dbn.add('{name}_before', <the density>), and compute {name!r} in all slices, "
+        f"initial=lambda {name}_before: {name}_before"
+    )
 
 
 # ---- private ------------------------------------------------------------------------------------
