@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import types
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -40,34 +40,23 @@ def fingerprint(model: Model) -> Fingerprint:
     >>> [what for what, now in of(3.0).items() if of(2.0)[what] != now], of(2.0) == of(2.0)
     (["the density of node 'y'"], True)
     """
-    found = {"the nodes": _short(list(model.nodes)), "the sizes of plates": repr(dict(model.sizes))}
-    if model.labels:
-        found["the labels of plates"] = digest(model.labels)
-    for name, node in model.nodes.items():
-        found[f"the declaration of node {name!r}"] = digest(_outline(node))
-        if node.declaration.source == "function":
-            found[f"the density of node {name!r}"] = _of_function(
-                model, name, node.declaration.function
-            )
-    for name, (potential, _) in model.potentials.items():
-        rest = potential.parents, potential.plates, potential.index, potential.is_table
-        found[f"the scope of potential {name!r}"] = digest(rest)
-        found[f"the potential {name!r}"] = _of_function(model, name, potential.function)
-    return found
+    return _told(model, _of_function)
 
 
 def lasting_fingerprint(models: Mapping[str, Model]) -> Fingerprint:
     """What several models say, each by where it stands; empty where functions are gone.
 
-    What cannot be seen of a function is not in it, and no warning says so.
+    Functions that cannot be followed are not in it: they may read objects that change as they are used, such
+    as one that remembers what it worked out.
     """
     declared = [node.declaration for model in models.values() for node in model.nodes.values()]
     if any(own.source == "function" and own.function is None for own in declared):
         return {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", CheckpointWarning)
-        each = {where: fingerprint(model) for where, model in models.items()}
-    return {f"{where} {what}": told for where, own in each.items() for what, told in own.items()}
+    return {
+        f"{where} {what}": told
+        for where, model in models.items()
+        for what, told in _told(model, _of_graph).items()
+    }
 
 
 def evidence_fingerprint(observed: Mapping[str, Observed], what: str = "evidence") -> Fingerprint:
@@ -79,6 +68,23 @@ def evidence_fingerprint(observed: Mapping[str, Observed], what: str = "evidence
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _told(model: Model, of_function: Callable[[Model, str, Any], str]) -> Fingerprint:
+    found = {"the nodes": _short(list(model.nodes)), "the sizes of plates": repr(dict(model.sizes))}
+    if model.labels:
+        found["the labels of plates"] = digest(model.labels)
+    for name, node in model.nodes.items():
+        found[f"the declaration of node {name!r}"] = digest(_outline(node))
+        if node.declaration.source == "function":
+            found[f"the density of node {name!r}"] = of_function(
+                model, name, node.declaration.function
+            )
+    for name, (potential, _) in model.potentials.items():
+        rest = potential.parents, potential.plates, potential.index, potential.is_table
+        found[f"the scope of potential {name!r}"] = digest(rest)
+        found[f"the potential {name!r}"] = of_function(model, name, potential.function)
+    return found
 
 
 def _short(names: list[str]) -> str:
@@ -102,14 +108,19 @@ def _of_function(model: Model, name: str, function: Any) -> str:
             stacklevel=2,
         )
 
+    return _of_graph(model, name, function) or "code " + digest(function, unseen)
+
+
+def _of_graph(model: Model, name: str, function: Any) -> str:
+    """Of a function that can be followed, else nothing."""
     try:
         found = density(model, name)
     except BayesmcError:
-        return digest(function, unseen)
-    if isinstance(found, Followed):
-        # a graph holds the numbers of large arrays as they were when the function was read
-        return "graph " + digest((found.result, *_large(function)))
-    return "code " + digest(function, unseen)
+        return ""
+    if not isinstance(found, Followed):
+        return ""
+    # a graph holds the numbers of large arrays as they were when the function was read
+    return "graph " + digest((found.result, *_large(function)))
 
 
 def _large(function: Any) -> Iterator[np.ndarray]:
