@@ -60,8 +60,8 @@ class Assessed:
             Observed nodes; all of them where none is named, each element of their plates by itself.
         log_jacobian : array_like or dict, optional
             Where a node observes z = f(y) and y is to be predicted: ``log |dz/dy|`` of each observation,
-            which broadcasts to the node's plates (``-np.log(y)`` for z = log y); a dict from node to array where
-            there are several.
+            which broadcasts to the node's plates (``-np.log(y)`` for z = log y); a dict from node to array
+            where there are several.
 
         Returns
         -------
