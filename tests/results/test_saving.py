@@ -58,18 +58,7 @@ def test_posteriors(engine: Any, tmp_path: Path) -> None:
     before.save(path)
     after = bmc.load(path)
     assert type(after) is type(before)
-    told, wanted = answers(after), answers(before)
-    if isinstance(
-        engine, bmc.Exact
-    ):  # sums over tables: their last digit hangs on where arrays lie
-        assert told.keys() == wanted.keys()
-        for key, value in wanted.items():
-            if isinstance(value, type):
-                assert told[key] is value
-            else:
-                np.testing.assert_allclose(told[key], value, rtol=1e-13, atol=1e-15)
-    else:
-        assert str(told) == str(wanted)
+    assert str(answers(after)) == str(answers(before))
     assert after.log_marginal_likelihood == before.log_marginal_likelihood
     if isinstance(engine, bmc.ExpectationPropagation):
         with pytest.raises(UnsupportedError, match="without its functions"):

@@ -175,6 +175,11 @@ class MarginalStep(FilterStep):
         """All values of the slice that particles have; those that are not kept go later."""
         return {n: values[n] for n in self.slices.dynamic if n in values}
 
+    @property
+    def by_element(self) -> bool:
+        """Whether particles carry a Gaussian of each element of a plate, not one of everything."""
+        return False
+
     def scouting(self) -> MarginalScouting:
         return MarginalScouting(self)
 

@@ -14,7 +14,6 @@ from bayesmc.engines.marginal.elements.beliefs import DrawnLater
 from bayesmc.engines.marginal.elements.guides import Guide
 from bayesmc.engines.marginal.elements.plan import ElementPlan
 from bayesmc.engines.marginal.elements.step import ElementFilter
-from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split
 from bayesmc.engines.marginal.step import MarginalStep, degenerate
 from bayesmc.engines.marginal.tables.afterwards import drawn_afterwards
@@ -68,12 +67,6 @@ class ElementStep(MarginalStep):
     def by_element(self) -> bool:
         """Whether beliefs are by element: not where slices before are to be told more."""
         return not (self.whole or self.lag)
-
-    def scouting(self) -> MarginalScouting:
-        found = super().scouting()
-        if self.by_element:
-            found.nodes = ()  # a scout carries one Gaussian, not one of each element
-        return found
 
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
         if not self.by_element:
