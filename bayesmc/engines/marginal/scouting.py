@@ -55,7 +55,11 @@ class MarginalScouting(Scouting):
         sampled = [n for n in step.slices.stochastic if n not in inner]
         if step.tables is not None:
             sampled = [n for n in sampled if n not in step.tables.plan.below]
-        if step.blocks or step.by_element or any(step.slices.later[n].domain is None for n in sampled):
+        if (
+            step.blocks
+            or step.by_element
+            or any(step.slices.later[n].domain is None for n in sampled)
+        ):
             self.nodes = ()
         self.nodes = tuple(n for n in self.nodes if n.name in sampled)
         self._choices: dict[int, Choices] = {}
