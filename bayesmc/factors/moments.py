@@ -90,8 +90,9 @@ class Moments:
             if self._count(scope) > _MANY and not self._of[block].scope:
                 self._collapsed[block] = self._by_parents(block)
             else:
-                group = [b for b, s in self.scopes.items() if s == scope]
-                self._collapsed.update(self._collapse(group, tuple(scope)))
+                among = frozenset(scope)
+                group = [b for b, s in self.scopes.items() if frozenset(s) == among]
+                self._collapsed.update(self._collapse(group, scope))
         return self._collapsed[block]
 
     def components(
@@ -215,12 +216,13 @@ class Moments:
 
 def mixture_scopes(
     blocks: Mapping[Any, tuple[Scope, Sequence[Any]]],
-) -> dict[Any, frozenset[Any]]:
+) -> dict[Any, Scope]:
     """For every block the discrete variables that its mixture runs over, parents before children.
 
-    ``blocks`` maps each block to its own discrete scope and its parent blocks.
+    ``blocks`` maps each block to its own discrete scope and its parent blocks. The order of variables is
+    that of these, not of a set: sums over configurations are then the same bits in every process.
     """
-    scopes: dict[Any, frozenset[Any]] = {}
+    scopes: dict[Any, Scope] = {}
     todo = list(blocks)
     while todo:
         block = todo[-1]
@@ -231,7 +233,7 @@ def mixture_scopes(
             continue
         todo.pop()
         if block not in scopes:
-            scopes[block] = frozenset(own).union(*(scopes[p] for p in parents))
+            scopes[block] = tuple(dict.fromkeys([*(v for p in parents for v in scopes[p]), *own]))
     return scopes
 
 

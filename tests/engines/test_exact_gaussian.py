@@ -10,6 +10,9 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -1007,3 +1010,33 @@ def test_histograms_of_exact_marginals() -> None:
     assert seen.tolist() == pytest.approx([0.0, 3.0, 0.0])
     with pytest.raises(UnsupportedError, match="number of bins"):
         posterior.marginal("x", 1).histogram(bins="auto")
+
+
+#: a mixture over four finite variables: its quantiles are sums in the order of these
+HASHED = """
+import numpy as np
+import bayesmc as bmc
+net = bmc.BayesNet()
+for k, p in enumerate((0.3, 0.4, 0.15, 0.7)):
+    net.add(f"s{k}", bmc.Bernoulli(p))
+net.add("x", lambda s0, s1: bmc.Normal(np.where(s0 == 1, 1.1, -0.3) + s1, 1.0))
+net.add("y", lambda x, s2, s3: bmc.Normal(x + 0.7 * s2 - 2.1 * s3, 0.5))
+posterior = bmc.infer(net, {}, engine=bmc.Exact())
+levels = np.linspace(0.01, 0.99, 99)
+print(posterior.quantile("y", levels).tolist(), posterior.var("y"), posterior.marginal("y").weights.tolist())
+"""
+
+
+def test_answers_are_the_same_bits_whatever_strings_hash_to() -> None:
+    """Python salts hashes of strings anew in every process, and with them the order of sets."""
+    found = {
+        subprocess.run(
+            [sys.executable, "-c", HASHED],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for seed in ("1", "2", "3")
+    }
+    assert len(found) == 1

@@ -181,7 +181,8 @@ def test_scopes_of_mixtures() -> None:
         rng = np.random.default_rng([2, seed])
         conditionals, _ = network(rng, 9)
         scopes = mixture_scopes({c.block: (c.scope, c.parents) for c in conditionals})
-        assert scopes == above(conditionals)
+        assert {b: frozenset(s) for b, s in scopes.items()} == above(conditionals)
+        assert all(len(set(s)) == len(s) for s in scopes.values())
         order = list(scopes)
         of = {c.block: c for c in conditionals}
         assert all(order.index(p) < order.index(b) for b in order for p in of[b].parents)
