@@ -48,6 +48,12 @@ class Observed:
     mask: np.ndarray | None = None
     parts: np.ndarray | None = None
 
+    def numbers(self, event_ndim: int) -> np.ndarray:
+        """Which numbers were seen, those of vectors seen in part included; it broadcasts to values."""
+        mask = np.asarray(True if self.mask is None else self.mask)
+        mask = np.expand_dims(mask, tuple(range(mask.ndim, mask.ndim + event_ndim)))
+        return mask if self.parts is None else mask | self.parts
+
 
 def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str, Observed]:
     """Check and store evidence; nodes given as None are left out."""

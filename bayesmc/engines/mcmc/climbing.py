@@ -303,7 +303,7 @@ def in_order(
     inside, links = set(target.chain), set(target.links)
     for name, node in target.model.nodes.items():
         if name in inside:
-            values[name] = _with_seen(target, node, value(node, values))
+            values[name] = target.with_seen(name, value(node, values))
         elif name in links:
             computed, _ = target.model.evaluate(name, values)
             values[name] = np.array(np.broadcast_to(computed, (rows, *node.value_shape)))
@@ -311,16 +311,6 @@ def in_order(
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _with_seen(target: Target, node: CompiledNode, value: np.ndarray) -> np.ndarray:
-    """Values of a node with what was observed of it put in place."""
-    seen = target.seen(node.name)
-    if seen is None:
-        return value
-    assert seen.mask is not None
-    mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
-    return np.where(mask, seen.value, value)
 
 
 def _wide(rows: np.ndarray, like: np.ndarray) -> np.ndarray:

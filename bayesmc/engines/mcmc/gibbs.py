@@ -20,6 +20,7 @@ from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.accepted import Accepted, finite_kernel, number_kernel
 from bayesmc.kernels.base import ANYHOW, How, Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
+from bayesmc.kernels.completed import completed_kernel, is_seen_in_part
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.ensemble import BlockWalk
@@ -136,7 +137,7 @@ class Gibbs(ChainEngine):
         def planned(problem: Problem) -> None:
             self._plan(problem)
 
-        return refused(problem, "Gibbs", "has no kernel for this net", planned)
+        return refused(problem, "Gibbs", "has no kernel for this net", planned, takes_parts=True)
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return {row.node: str(row) for row in self.table(problem)}
@@ -205,14 +206,18 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: H
     vectors = [
         b for b in vector_blocks(target, blankets, joined, debug) if governing(target, b, blankets)
     ]
+    in_part = [n for n, b in blankets.items() if is_seen_in_part(b)]
     blocks += vectors
     joined |= {n for b in vectors for n in b.names}
     forms = Forms(target)
     kernels, constraints = _finite(target, blankets, forms, debug)
+    completed = [completed_kernel(blankets[n]) for n in in_part if n not in joined]
+    joined |= set(in_part)
     left = [n for n in names if n not in joined and target.model[n].domain is None]
     conjugate, refusals = _conjugate(blankets, forms, left, debug)
     joints = [k.joint for k in kernels if isinstance(k, ForestBlock) and k.joint is not None]
     kernels += [k.reading(joints) if isinstance(k, Conjugate) else k for k in conjugate]
+    kernels += completed
     scales_of = [governing(target, block, blankets) for block in blocks]
     governed = {n for scales in scales_of for n in scales}
     closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]

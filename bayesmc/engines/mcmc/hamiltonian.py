@@ -129,7 +129,11 @@ class HamiltonianMonteCarlo(ChainEngine):
 
     def refusal(self, problem: Problem) -> str | None:
         return refused(
-            problem, type(self).__name__, "follows gradients, and this net has none", self._fits
+            problem,
+            type(self).__name__,
+            "follows gradients, and this net has none",
+            self._fits,
+            takes_parts=True,
         )
 
     def describe(self, problem: Problem) -> dict[str, str]:

@@ -139,7 +139,11 @@ def block_name(kernel: Kernel) -> str:
 
 
 def refused(
-    problem: Problem, who: str, words: str, planned: Callable[[Problem], str | None]
+    problem: Problem,
+    who: str,
+    words: str,
+    planned: Callable[[Problem], str | None],
+    takes_parts: bool = False,
 ) -> str | None:
     """Why an engine whose kernels sweep over a net cannot answer; None where it can.
 
@@ -152,8 +156,10 @@ def refused(
         What is said before the reason where something is unsupported: "has no kernel for this net".
     planned : callable
         Makes the plan, or says why there is none.
+    takes_parts : bool
+        Whether its kernels leave components alone that were seen of vectors seen in part.
     """
-    parts = refuse_parts(problem.observed, who)
+    parts = None if takes_parts else refuse_parts(problem.observed, who)
     if parts is not None:
         return parts
     try:
