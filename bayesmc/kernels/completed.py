@@ -101,7 +101,7 @@ class Completed(Kernel):
             if pattern.all():
                 continue
             here = (self.known == pattern).all(axis=1)
-            completed = dist.completed(rng, shape, now, pattern)  # type: ignore[attr-defined]
+            completed = dist.completed(rng, shape, now, pattern)
             drawn[:, here] = self._flat(completed)[:, here]
         return drawn.reshape(now.shape)
 

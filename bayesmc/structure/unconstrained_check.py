@@ -20,7 +20,7 @@ from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.expression import Expression, Program
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.summing import Summed
-from bayesmc.structure.target import Target, Term, Values
+from bayesmc.structure.target import Term, Values
 
 #: points, and how far the free numbers of each are from zero
 _SPREADS = (0.0, 3.0, 0.1, 5.0, 1.0, 2.0, 0.3, 1.0)

@@ -39,9 +39,13 @@ def test_an_index_that_varies_picks_as_numpys_does():
         shape = tuple(int(n) for n in rng.integers(1, 4, size=rng.integers(1, 5)))
         value, keys = rng.normal(size=shape), random_keys(rng, shape)
         given = {f"k{n}": k for n, k in enumerate(keys) if isinstance(k, np.ndarray)}
-        known = dict(list(given.items())[1:]) if rng.random() < 0.3 else {}  # beside one that varies
+        known = (
+            dict(list(given.items())[1:]) if rng.random() < 0.3 else {}
+        )  # beside one that varies
         named = [
-            TracedArray(leaf(f"k{n}", k.shape, int)) if f"k{n}" in given and f"k{n}" not in known else k
+            TracedArray(leaf(f"k{n}", k.shape, int))
+            if f"k{n}" in given and f"k{n}" not in known
+            else k
             for n, k in enumerate(keys)
         ]
         try:
@@ -67,12 +71,13 @@ def test_an_index_that_is_no_whole_number_or_beyond_is_refused():
             indexed(x, key)
 
 
+YEAR = np.arange(6) % 3
 PICKED = {
     "input": lambda beta, year: bmc.Normal(2 * beta[..., 0, year] + 1, 0.5),
-    "array": lambda beta, year, at=np.arange(6) % 3: bmc.Normal(2 * beta[..., 0, at] + 1, 0.5),
+    "array": lambda beta, year, at=YEAR: bmc.Normal(2 * beta[..., 0, at] + 1, 0.5),
 }
 EVIDENCE = {"y": np.array([0.1, 1.7, np.nan, -0.4, 2.0, 0.9])}
-INPUTS = {"year": np.arange(6) % 3}
+INPUTS = {"year": YEAR}
 
 
 def as_vector(function) -> bmc.BayesNet:

@@ -61,7 +61,7 @@ class SweepSampler:
         for i, kernel in enumerate(self.kernels):
             new, memory[i] = kernel.step(values, memory[i], rng, warmup)
             if i >= self._checked:  # each kernel once
-                _check_moved(kernel, new, values)
+                _check_moved(self.target, kernel, new, values)
                 self._checked = i + 1
             values.update(new)
             self.target.refresh(values, kernel.names)
@@ -181,7 +181,9 @@ def _apart(target: Target) -> frozenset[str]:
     return frozenset(target.forward) - moved
 
 
-def _check_moved(kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+def _check_moved(
+    target: Target, kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, Any]
+) -> None:
     """Refuse what is no move of a kernel's nodes: of a kernel that somebody wrote, this may be."""
     step = f"{type(kernel).__name__}.step"
     for name in kernel.names:
@@ -195,3 +197,8 @@ def _check_moved(kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, An
             )
         if not np.isfinite(new[name]).all():
             raise ModelError(f"{step} returned {name!r} with values that are not finite")
+        if (target.with_seen(name, new[name]) != new[name]).any():
+            raise ModelError(
+                f"{step} returned {name!r} with other values than were observed of it; put these in their "
+                "place (target.with_seen)"
+            )
