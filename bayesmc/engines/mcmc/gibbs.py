@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.jointly import trajectories_of
@@ -33,7 +36,7 @@ from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import lattice_kernel, site_forest
-from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew
+from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew, some_support
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.rescaled import rescaled_kernels
 from bayesmc.kernels.slice import Slice
@@ -190,7 +193,9 @@ def plan_of(
     if only is not None:
         key += f", only {sorted(only)}"
     if key not in problem.cache:
-        problem.cache[key] = _planned(problem, debug, only, how)
+        # kernels are tried on reachable values, at which numbers may put a parameter out of range
+        with marking_invalid(), np.errstate(all="ignore"):
+            problem.cache[key] = _planned(problem, debug, only, how)
     return problem.cache[key]
 
 
@@ -367,11 +372,7 @@ def _numbers(
 
 def _kind(target: Target, blanket: Blanket) -> str:
     """The kind of a node's support, its bounds apart."""
-    support = blanket.node.support
-    if support is None:  # the bounds depend on parents
-        assert blanket.own is not None
-        support = blanket.own.distribution({**target.model.probe, **target.known})[0].support
-    return support.kind
+    return some_support(target.model, blanket.name, target.known).kind
 
 
 def _together(
