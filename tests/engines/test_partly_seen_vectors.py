@@ -302,6 +302,19 @@ def test_a_covariance_of_rows_seen_in_part():
     assert abs(rho.mean()) < 0.1 and abs(rho.std() - 0.659) < 0.03
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+def test_log_likelihoods_are_of_what_was_seen():
+    net, evidence = camel()
+    found = bmc.infer(net, evidence, engine=bmc.Gibbs(400, warmup=100, chains=8), rng=0)
+    log = found.log_likelihood("x")["x"]
+    cov = np.linalg.inv(found["precision"])
+    for k, row in ((0, [0, 1]), (4, [0]), (6, [1])):
+        part = cov[3, 7][np.ix_(row, row)]
+        wanted = stats.multivariate_normal(cov=part).logpdf(evidence["x"][k][row])
+        assert log[3, 7, k] == pytest.approx(wanted)
+    assert len(found.loo().pointwise) == 12
+
+
 def test_a_kernel_that_moves_what_was_seen_is_refused(monkeypatch):
     from bayesmc.kernels.completed import Completed
 
