@@ -82,7 +82,7 @@ def picked_by_row(
     Examples
     --------
     >>> from bayesmc.network.clashing import picked_by_row
-    >>> picked_by_row({"row": 7}, {"beta": (1, 3)}, (3, 2), "batch shape (3, 2, 1, 7)")[:62]
+    >>> picked_by_row({"row": 7}, {"beta": (1, 3)}, (3, 2), "batch shape (3, 2, 1, 7)")[:59]
     "its parent 'beta' is a vector and arrives as (*batch, 1, 3)"
     """
     over = tuple(plates.values())
