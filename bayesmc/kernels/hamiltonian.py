@@ -153,7 +153,7 @@ class Hamiltonian(Kernel):
         nobody = np.zeros(chains, dtype=bool)
         return {
             "place": {"u": u, "log": log, "slope": slope},
-            "values": {n: values[n] for n in self.names},
+            "values": {n: values[n] for n in self.density.names},
             "metric": self.metric.start(slope),
             "step": self.step_size.start(np.zeros(chains)),
             "machine": self._compiled is not None,
@@ -254,7 +254,7 @@ class Hamiltonian(Kernel):
     def _place(self, values: Values, memory: Memory, gradient: Gradient) -> Place:
         """Where the chains are: as the last step left them, or as somebody else has."""
         known, last = memory["place"], memory["values"]
-        same = all(values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.names)
+        same = all(values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.density.names)
         if same and not self.given:
             return Place(**known)
         u = known["u"] if same else self.density.unconstrain(values)

@@ -91,7 +91,7 @@ def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> str:
         return ""
     found: list[tuple[float, str]] = []
     left = _NUMBERS
-    for name in kernel.names:
+    for name in kernel.density.names:
         stored = posterior._stored.get(name)
         if stored is None or left < diverged.size:
             continue
