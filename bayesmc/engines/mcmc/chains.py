@@ -285,7 +285,7 @@ class ChainEngine(Engine):
             if not loop.draw(state, held, draws, bar, stop):
                 return False
             done = held.draws - before
-            if wanted is None or done >= lengths.draws:
+            if wanted is None or done >= lengths.most:
                 return True
             share = reached(wanted)
             if share >= 1:

@@ -45,8 +45,8 @@ class HamiltonianMonteCarlo(ChainEngine):
     Parameters
     ----------
     draws : int, optional
-        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
-        warning that names the node.
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain
+        (up to twice that where it is nearly there) and a warning that names the node.
     warmup : int, optional
         Draws before that, in which the step and the metric are learnt from all chains together; by default
         until chains have forgotten where they started, 1,000 at most (with ``draws``: 1,000).

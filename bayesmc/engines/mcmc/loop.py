@@ -23,6 +23,8 @@ from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, 
 _END = 100
 #: draws of each chain from which on a run may be seen not to get to its effective size
 _HOPELESS = 500
+#: how many times what is announced a run makes at most that would get there so
+_FURTHER = 2
 #: draws of each chain in the first round, at least, and how much longer a later round may make a run
 _ROUND, _GROWTH = 16, 3.0
 
@@ -87,7 +89,7 @@ class Lengths:
     warmup : int
         Sweeps; at most, where there is a ``judge``.
     draws : int
-        Of each chain; at most, where there is an ``ess``.
+        Of each chain; where there is an ``ess`` at most, or up to ``most`` where these will do.
     superchains : int
         Groups of consecutive chains that start as one; 0 where every chain starts by itself.
     ess : float or None
@@ -102,6 +104,11 @@ class Lengths:
     superchains: int = 0
     ess: float | None = None
     judge: Callable[[Mapping[str, np.ndarray]], bool] | None = None
+
+    @property
+    def most(self) -> int:
+        """Draws of each chain that a run makes that is nearly there after ``draws``."""
+        return self.draws if self.ess is None else _FURTHER * self.draws
 
     def ends(self) -> Iterator[int]:
         """Sweeps at which the warmup may end."""
@@ -120,12 +127,13 @@ class Lengths:
     def further(self, made: int, share: float) -> int:
         """Draws of each chain in the next round, where those made are a share of what is wanted.
 
-        None where even all that are allowed would not do.
+        None where even the most that a run makes would not do: the limit is there for the hopeless, and
+        whoever is nearly there goes on.
         """
-        if made >= _HOPELESS and share * self.draws < 0.5 * made:
+        if made >= min(_HOPELESS, self.draws) and share * self.most < made:
             return 0
         needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
-        return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
+        return min(max(math.ceil(needed) - made, made // 8, 1), self.most - made)
 
 
 class Begun(NamedTuple):
