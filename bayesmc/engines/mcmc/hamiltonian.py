@@ -151,7 +151,7 @@ class HamiltonianMonteCarlo(ChainEngine):
         text = super().effort(problem)
         if not moving:
             return text
-        density = density_of(problem, moving, self._summed(problem, moving))
+        density = density_of(problem, moving, self.summed(problem))
         told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
         return f"{text}; {told}" if told else text
 
@@ -163,6 +163,11 @@ class HamiltonianMonteCarlo(ChainEngine):
         sampler = SweepSampler(plan.target, plan.kernels)
         sampler.climbs = True
         return sampler
+
+    def summed(self, problem: Problem) -> tuple[str, ...]:
+        """Finite nodes that are summed out."""
+        moving = self._moving(problem) if self.marginalize else ()
+        return summed_with(problem, moving) if moving else ()
 
     def _fits(self, problem: Problem) -> str | None:
         """Why it has nothing to move."""
@@ -181,15 +186,11 @@ class HamiltonianMonteCarlo(ChainEngine):
         jump = jumping(problem, density_of(problem, names)) if names else ()
         return tuple(n for n in names if n not in jump)
 
-    def _summed(self, problem: Problem, moving: tuple[str, ...]) -> tuple[str, ...]:
-        """Finite nodes that are summed out."""
-        return summed_with(problem, moving) if self.marginalize else ()
-
     def _plan(self, problem: Problem) -> Plan:
         """Kernels of what is finite, and one for all that is continuous."""
         target = target_of(problem)
         moving = self._moving(problem)
-        summed = self._summed(problem, moving) if moving else ()
+        summed = self.summed(problem)
         rest = [n for n in target.chain if n not in (*moving, *summed)]
         plan = plan_of(problem, only=rest)
         if not moving:
