@@ -254,7 +254,9 @@ class Hamiltonian(Kernel):
     def _place(self, values: Values, memory: Memory, gradient: Gradient) -> Place:
         """Where the chains are: as the last step left them, or as somebody else has."""
         known, last = memory["place"], memory["values"]
-        same = all(values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.density.names)
+        same = all(
+            values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.density.names
+        )
         if same and not self.given:
             return Place(**known)
         u = known["u"] if same else self.density.unconstrain(values)

@@ -60,9 +60,9 @@ class HamiltonianMonteCarlo(ChainEngine):
     max_depth : int
         Doublings of a trajectory, at most: up to ``2**max_depth - 1`` evaluations of the gradient for a draw.
     marginalize : bool
-        Whether finite nodes are summed out of the density, where that is known to be possible, and drawn given
-        the numbers: labels of a plate element by element, others by their joint states, at most 512
-        (`bmc.log_density`). It mixes where labels and numbers cling to each other.
+        Whether finite nodes are summed out of the density where they can be, and drawn given the numbers:
+        labels of a plate element by element, others by their joint states, at most 512 (`bmc.log_density`).
+        Labels and numbers that cling to each other mix so. Without it they are drawn in turn.
     metric : "diagonal" or "dense"
         Whether scales of all numbers are learnt, or their correlations, too: dense where a few hundred
         numbers at most are strongly correlated.
@@ -131,7 +131,9 @@ class HamiltonianMonteCarlo(ChainEngine):
                 "1, such as 0.8"
             )
         if not isinstance(self.marginalize, bool):
-            raise ValueError(f"{what}(marginalize={self.marginalize!r}): marginalize is True or False")
+            raise ValueError(
+                f"{what}(marginalize={self.marginalize!r}): marginalize is True or False"
+            )
         if self.metric not in _METRICS:
             raise ValueError(f'{what}(metric={self.metric!r}): metric is "diagonal" or "dense"')
 

@@ -53,7 +53,7 @@ def density_of(
 
 
 def summed_with(problem: Problem, moving: tuple[str, ...]) -> tuple[str, ...]:
-    """Finite nodes that can be summed out of the density of nodes that move; all of the chain or some of them.
+    """Finite nodes of the chain that can be summed out of the density of nodes that move.
 
     What hangs together is summed out together or not at all.
     """
