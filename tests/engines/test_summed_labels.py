@@ -116,14 +116,14 @@ def test_labels_of_several_kinds(seed: int) -> None:
 
 def test_what_cannot_be_summed_out_is_drawn_in_turn() -> None:
     """Labels that hang together, too many for a list, beside some that do not."""
-    net = bmc.BayesNet(plates={"i": 10, "j": 4})
+    net = bmc.BayesNet(plates={"i": 10, "j": 2})
     net.add("x", bmc.Laplace(0.0, 1.0))
     net.add("tied", bmc.Bernoulli(0.5), plates="i")
-    net.add("total", lambda tied, x: bmc.Normal(tied.sum("i") + x, 1.0))
+    net.add("total", lambda tied, x: bmc.Normal(tied.sum("i") + x, 3.0))
     net.add("loose", bmc.Bernoulli(0.5), plates="j")
     net.add("y", lambda x, loose: bmc.Normal(x + loose, 1.0), plates="j")
-    evidence = {"total": 3.0, "y": [0.5, 1.0, 2.0, -0.5]}
-    options: dict[str, Any] = {"draws": 100, "warmup": 200, "chains": 32}
+    evidence = {"total": 3.0, "y": [0.5, 1.0]}
+    options: dict[str, Any] = {"draws": 200, "warmup": 200, "chains": 32}
     engine = bmc.HamiltonianMonteCarlo(**options, marginalize=True)
     table = {row.node: row.kernel for row in bmc.explain(net, evidence, engine=engine).table}
     assert table["loose"] == "summed out"
@@ -133,7 +133,7 @@ def test_what_cannot_be_summed_out_is_drawn_in_turn() -> None:
     )
     for name in ("x", "tied", "loose"):
         error = np.hypot(one.mcse(name), other.mcse(name))
-        assert np.abs((one.mean(name) - other.mean(name)) / error).max() < 4.9  # 15 of them: 2e-5
+        assert np.abs((one.mean(name) - other.mean(name)) / error).max() < 4.9  # 13 of them: 2e-5
 
 
 def test_a_run_goes_on_as_it_would_have() -> None:
