@@ -117,3 +117,15 @@ def test_the_advice_is_not_what_the_model_does_already() -> None:
     assert "apart from" not in advice[True]
     for words in advice.values():
         assert "give tighter priors, or raise target_accept=0.4 (0.95 or 0.99 or 0.999)" in words
+
+
+def test_the_advice_where_a_scale_is_not_found() -> None:
+    """The exponential of a number is no power of it: effects hang on it all the same."""
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("log_sd", bmc.Normal(0.0, 3.0))
+    net.add("b", lambda log_sd: bmc.Normal(0.0, np.exp(log_sd)), plates="i")
+    net.add("y", lambda b: bmc.Normal(b, 3.0), plates="i")
+    engine = bmc.HamiltonianMonteCarlo(200, warmup=100, target_accept=0.4)
+    _, told = infer(net, {"y": np.linspace(-2, 2, 6)}, engine=engine)
+    (words,) = [t for t in told if "diverged" in t]
+    assert "declare effects apart from their scale (z ~ Normal(0, 1), b = sigma * z)" in words

@@ -54,7 +54,7 @@ def faulty_trajectories(
             yield (
                 f"{diverged} of {moves} trajectories diverged{_where(posterior, kernel)}: the density bends "
                 "there more sharply than their steps can follow, and draws leave it out; "
-                f"{_apart_from(kernels)}give tighter priors, or {_shorter(posterior, memory)}"
+                f"{_apart_from(kernel, kernels)}give tighter priors, or {_shorter(posterior, memory)}"
             )
         cut = int(memory["saturated"].sum())
         if cut > _CUT * moves:
@@ -66,23 +66,30 @@ def faulty_trajectories(
         if ratio < _LEAST_RATIO:
             yield (
                 f"energies change slowly (E-BFMI {ratio:.2f}, under {_LEAST_RATIO}): heavy tails or a funnel "
-                f"are not explored; {_apart_from(kernels)}declare heavy tails as a scale mixture, or give "
-                "tighter priors"
+                f"are not explored; {_apart_from(kernel, kernels)}declare heavy tails as a scale "
+                "mixture, or give tighter priors"
             )
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _apart_from(kernels: list[Any]) -> str:
+def _apart_from(kernel: Hamiltonian, kernels: list[Any]) -> str:
     """Effects that are to be declared apart from their scale, in words; empty where all are."""
     scaled = next((k for k in kernels if isinstance(k, Rescaled)), None)
-    if scaled is None:
-        return ""
-    return (
-        f"declare {', '.join(map(repr, scaled.below))} apart from the scale {scaled.name!r} "
-        "(z ~ Normal(0, 1), b = sigma * z), "
-    )
+    if scaled is not None:
+        return (
+            f"declare {', '.join(map(repr, scaled.below))} apart from the scale {scaled.name!r} "
+            "(z ~ Normal(0, 1), b = sigma * z), "
+        )
+    target = getattr(kernel.density, "target", None)
+    terms = {} if target is None else target.terms
+    moved = kernel.density.names
+    if any(
+        set(moved).intersection(target.hidden_above(terms[n])) - {n} for n in moved if n in terms
+    ):
+        return "declare effects apart from their scale (z ~ Normal(0, 1), b = sigma * z), "
+    return ""
 
 
 def _shorter(posterior: ChainsPosterior | ChainsSums, memory: Mapping[str, Any]) -> str:
