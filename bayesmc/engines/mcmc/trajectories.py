@@ -82,9 +82,10 @@ def _apart_from(kernel: Hamiltonian, kernels: list[Any]) -> str:
             f"declare {', '.join(map(repr, scaled.below))} apart from the scale {scaled.name!r} "
             "(z ~ Normal(0, 1), b = sigma * z), "
         )
-    target = getattr(kernel.density, "target", None)
-    terms = {} if target is None else target.terms
-    moved = kernel.density.names
+    target: Any = getattr(kernel.density, "target", None)
+    if target is None:
+        return ""
+    terms, moved = target.terms, kernel.density.names
     if any(
         set(moved).intersection(target.hidden_above(terms[n])) - {n} for n in moved if n in terms
     ):
