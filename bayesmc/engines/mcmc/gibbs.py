@@ -69,8 +69,8 @@ class Gibbs(ChainEngine):
     Parameters
     ----------
     draws : int, optional
-        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
-        warning that names the node.
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain
+        (up to twice that where it is nearly there) and a warning that names the node.
     warmup : int, optional
         Sweeps before that, in which widths and scales adapt; by default until chains have forgotten where
         they started, 1,000 at most (with ``draws``: 1,000).

@@ -56,8 +56,8 @@ class MetropolisHastings(ChainEngine):
     Parameters
     ----------
     draws : int, optional
-        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
-        warning that names the node.
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain
+        (up to twice that where it is nearly there) and a warning that names the node.
     warmup : int, optional
         Sweeps before that, in which scales and covariances adapt; 1,000 by default.
     chains : int, optional
