@@ -145,9 +145,9 @@ def ordinal() -> tuple[bmc.BayesNet, dict[str, Any]]:
 def captures() -> tuple[bmc.BayesNet, dict[str, Any]]:
     """Whoever was caught is there: forward draws of all that are there are never right."""
     rng = np.random.default_rng(0)
-    there, effect = rng.random(60) < 0.7, rng.normal(size=60)
-    caught = (rng.random((60, 4)) < expit(effect)[:, None]) & there[:, None]
-    net = bmc.BayesNet(plates={"animal": 60, "day": 4})
+    there, effect = rng.random(150) < 0.7, rng.normal(size=150)
+    caught = (rng.random((150, 4)) < expit(effect)[:, None]) & there[:, None]
+    net = bmc.BayesNet(plates={"animal": 150, "day": 4})
     net.add("share", bmc.Uniform(0.0, 1.0))
     net.add("chance", bmc.Uniform(0.0, 1.0), plates="day")
     net.add("sigma", bmc.Uniform(0.0, 5.0))
@@ -194,13 +194,12 @@ def test_a_finite_density_somewhere_is_enough(name: str) -> None:
 def test_labels_that_the_data_leave_one_state_are_no_cause_to_leave_the_prior() -> None:
     """Chains began at a scale of 1e-250 with all effects 0, where the density has no end, and stayed."""
     net, evidence = captures()
-    for seed in range(6):
-        with marking_invalid(), np.errstate(all="ignore"):
-            target = target_of(pose(net, evidence))
-            values = start_states(target, 4, np.random.default_rng(seed))
-        assert (values["sigma"] > 1e-3).all()  # of 24 draws of the prior one is below once in 200
-        assert (values["z"] >= evidence["y"].any(axis=1)).all()
-    posterior = bmc.infer(net, evidence, engine=bmc.Gibbs(20, 20), rng=0)
+    with marking_invalid(), np.errstate(all="ignore"):
+        target = target_of(pose(net, evidence))
+        values = start_states(target, 16, np.random.default_rng(0))
+    assert (values["sigma"] > 1e-3).all()  # of 16 draws of the prior one is below once in 300
+    assert (values["z"] >= evidence["y"].any(axis=1)).all()
+    posterior = bmc.infer(net, evidence, engine=bmc.Gibbs(5, 5, compiled=False), rng=0)
     assert (posterior["sigma"].std(axis=-1) > 0.0).all()
 
 
@@ -211,12 +210,11 @@ def test_a_climb_stays_out_of_the_neck_of_a_funnel() -> None:
     net.add("s", bmc.HalfNormal(1.0))
     net.add("u", lambda s: bmc.Normal(0.0, s), plates="i")
     net.add("y", lambda m, u: bmc.Uniform(m + u + 50.0, m + u + 51.0), plates="i")
-    for seed in range(3):
-        with marking_invalid(), np.errstate(all="ignore"):
-            target = target_of(pose(net, {"y": np.linspace(0.0, 0.5, 30)}))
-            values = start_states(target, 4, np.random.default_rng(seed))
-            assert np.isfinite(target.log_density(values)).all()
-        assert (values["s"] > 1e-3).all()
+    with marking_invalid(), np.errstate(all="ignore"):
+        target = target_of(pose(net, {"y": np.linspace(0.0, 0.5, 30)}))
+        values = start_states(target, 4, np.random.default_rng(0))
+        assert np.isfinite(target.log_density(values)).all()
+    assert (values["s"] > 1e-3).all()
 
 
 def test_both_engines_start_and_agree() -> None:
@@ -244,6 +242,21 @@ def test_impossible_evidence_is_named_at_once() -> None:
     net.add("t", lambda p: bmc.Truncated(bmc.Normal(p, 1.0), 0.0, totals / 10.0), plates="i")
     with pytest.raises(ZeroProbabilityError, match=r"'t' \(plate element 1\): 2.5.*from 0 to 1"):
         bmc.infer(net, {"t": [0.5, 2.5, 5.0, 0.5]}, engine=bmc.Gibbs(), rng=0)
+
+
+def test_what_other_counts_allow_is_not_impossible() -> None:
+    """Under so vague a rate all counts that were tried were 0, and what was seen was called impossible."""
+    net = bmc.BayesNet(plates={"site": 20, "visit": 3})
+    net.add("rate", bmc.Gamma(0.01, 0.01))
+    net.add("p", bmc.Beta(1.0, 1.0))
+    net.add("n", lambda rate: bmc.Poisson(rate), plates="site")
+    net.add("y", lambda n, p: bmc.Binomial(n, p), plates=("site", "visit"))
+    seen = np.random.default_rng(0).binomial(5, 0.4, (20, 3))
+    for seed in range(4):
+        with marking_invalid(), np.errstate(all="ignore"):
+            target = target_of(pose(net, {"y": seen}))
+            values = start_states(target, 4, np.random.default_rng(seed))
+        assert (values["n"] >= seen.max(axis=1)).all()
 
 
 def test_where_nothing_is_found_the_nearest_state_is_shown() -> None:

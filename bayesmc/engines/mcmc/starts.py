@@ -229,8 +229,9 @@ def refuse_impossible(target: Target, tried: Values, given: Collection[str] = ()
         if term.is_potential or name in target.chain or name not in target.known:
             continue
         above = target.hidden_above(term)
-        if any(n in given or target.model[n].domain is not None for n in above):
-            continue  # another value, or a state that was not drawn, may allow it
+        nodes = [target.model[n] for n in above]
+        if any(n.name in given or n.is_discrete or n.domain is not None for n in nodes):
+            continue  # another value, or a state or count that was not drawn, may allow it
         dist, _ = term.distribution(values)
         support, value = dist.support, np.asarray(target.known[name])
         if support.kind not in ("interval", "integers") or target.model[name].event_shape:
