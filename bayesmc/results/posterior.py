@@ -23,7 +23,7 @@ from bayesmc.results.dataframes import Framed
 from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.marginal_answers import MarginalAnswers
-from bayesmc.results.over_time import expanded, take_templates
+from bayesmc.results.over_time import expanded, take_templates, without_functions
 from bayesmc.results.query import Query
 from bayesmc.results.saving import save
 from bayesmc.results.shown import posterior_html
@@ -400,7 +400,7 @@ class Posterior(Assessed, MarginalAnswers, Framed):
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
         inputs = self.problem.inputs if self.problem is not None else self._known
-        bare = self.model.without_functions()
+        bare = without_functions(self.model)
         return {**self.__dict__, "problem": None, "model": bare, "_known": inputs}
 
     def __copy__(self) -> Posterior:

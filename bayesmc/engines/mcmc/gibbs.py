@@ -91,7 +91,7 @@ class Gibbs(ChainEngine):
     ess : float
         Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
-        Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
+        Node -> where its chains start: what broadcasts to ``(*plates, *event)`` for all of them, or to
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
         these. What nothing observed depends on is drawn forward, wherever it starts.
     groups : int, optional
