@@ -77,9 +77,9 @@ class Labels:
     def __init__(self, target: Target, given: Iterable[str] = ()) -> None:
         self.target = target
         free, nodes = set(target.chain).difference(given), target.model
-        names = [n for n in target.chain if n in free and nodes[n].domain is not None]
-        names = [n for n in names if nodes[n].domain.size <= _LABELS]  # type: ignore[union-attr]
-        few = _ROUNDS * sum(nodes[n].domain.size for n in names) <= _CALLS  # type: ignore[union-attr]
+        domains = {n: nodes[n].domain for n in target.chain if n in free}
+        sizes = {n: d.size for n, d in domains.items() if d is not None and d.size <= _LABELS}
+        names, few = list(sizes), _ROUNDS * sum(sizes.values()) <= _CALLS
         self.blankets = [Blanket(target, n) for n in names] if few else []
 
     def __bool__(self) -> bool:
@@ -125,6 +125,6 @@ def _picked(
     blanket: Blanket, log: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which elements can be in some state, and states drawn: any where none can be."""
-    can = (log > -np.inf).any(axis=0)
+    can = np.asarray((log > -np.inf).any(axis=0))
     chance = rng.random(log.shape[1:])
     return can, pick_log(np.where(can, log, 0.0), chance, f"node {blanket.name!r}")
