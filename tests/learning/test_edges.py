@@ -53,6 +53,7 @@ def test_a_noise_that_is_zero_is_a_maximum(unit: float) -> None:
     assert found.std_errors["r"] / unit == pytest.approx((-bend) ** -0.5, rel=1e-3)
 
 
+@pytest.mark.thorough
 def test_random_levels_are_at_the_edge_where_the_dense_gaussian_has_its_maximum() -> None:
     edges = 0
     for seed in range(6):
@@ -124,6 +125,7 @@ def forward(start: np.ndarray, rows: np.ndarray, seen: np.ndarray, y: np.ndarray
     return total
 
 
+@pytest.mark.thorough
 def test_rows_of_a_hidden_chain_that_end_at_zero_are_maxima() -> None:
     seen = np.array([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8]])
     start = np.full(3, 1 / 3)
