@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +25,8 @@ _FLAT, _SLOPE = 1e-4, 1e-3
 #: information below which numbers are not told, over a step as long as they are; the same of combinations
 #: of them, beside that of each by itself
 _UNTOLD, _SINGULAR = 1e-4, 1e-6
+#: the same below which a ridge is looked for, and steps that others make to follow it
+_DOUBTFUL, _FOLLOWS = 1e-3, 10
 #: nats that the objective must be lower two standard errors away, where a parabola is 2 lower
 _FALL = 0.02
 
@@ -112,7 +114,61 @@ def maximum(
     _settle(objective, best.u)
     value = objective.value(best.u)
     ends = np.sort([value if climb is best else climb.value for climb in ended])[::-1]
-    return _polished(objective, best._replace(value=value), ends)
+    return _maximum(objective, best._replace(value=value), ends)
+
+
+def climbed_on(
+    objective: Objective, found: Maximum, u: np.ndarray, tolerance: float, most: int
+) -> Maximum:
+    """A maximum by one more climb, from a point that is higher than another."""
+    bar = Progress(None, "fit", False)
+    _settle(objective, u)
+    climb = _Climb(u, objective.value(u), found.history, found.steps)
+    for _ in range(_ROUNDS):  # quasi-Newton steps from where it is next to level may end at once
+        more = _climbed(objective, climb.u, climb.value, tolerance, most, bar)
+        rose = more.value - climb.value
+        history = np.append(climb.history, more.history)
+        climb = more._replace(history=history, steps=climb.steps + more.steps)
+        if not rose > _GAIN:
+            break
+    return _maximum(objective, climb, np.append(max(found.ends[0], climb.value), found.ends[1:]))
+
+
+def polished(objective: Objective, found: Maximum) -> Maximum:
+    """Newton's steps at the end, as long as they rise: quasi-Newton ones stop where differences are rough."""
+    u, value, history, steps = found.u, found.value, found.history, found.steps
+    if not len(u):
+        return replace(found, hessian=np.zeros((0, 0)), rise=0.0)
+    for _ in range(8):
+        slope, hessian = objective.gradient(u), curvature(objective, u)
+        rise, step = newton_step(slope, hessian)
+        if not rise > 1e-10:
+            break
+        new = u + step
+        higher = objective.value(new)
+        if not higher > value:
+            break
+        u, value, steps = new, higher, steps + 1
+        history = np.append(history, higher)
+    ends = np.append(max(found.ends[0], value), found.ends[1:])
+    return Maximum(u, value, history, hessian, rise, steps, ends)
+
+
+def newton_step(slope: np.ndarray, hessian: np.ndarray) -> tuple[float, np.ndarray]:
+    """How far Newton's step would rise, and the step, along directions that are curved.
+
+    Along others (a number at the edge of its support, an angle of no account) the slope must be next to none.
+    """
+    nothing = float("nan"), np.zeros(len(slope))
+    if not (np.isfinite(hessian).all() and np.isfinite(slope).all()):
+        return nothing
+    values, vectors = np.linalg.eigh(-hessian)
+    told = values > max(_FLAT, 1e-9 * values.max(initial=0.0))
+    along = vectors.T @ slope
+    if (values < -_FLAT).any() or (np.abs(along[~told]) > _SLOPE).any():
+        return nothing
+    step = along[told] / values[told]
+    return float(0.5 * along[told] @ step), vectors[:, told] @ step
 
 
 def curvature(objective: Objective, u: np.ndarray) -> np.ndarray:
@@ -127,11 +183,18 @@ def curvature(objective: Objective, u: np.ndarray) -> np.ndarray:
     return 0.5 * (found + found.T)
 
 
-def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np.ndarray]]:
+def told_part(
+    objective: Objective, found: Maximum, bounded: np.ndarray
+) -> tuple[np.ndarray, list[np.ndarray]]:
     """The covariance that a curvature says, and groups of numbers that it does not tell.
 
     A direction is told where the objective is curved in it, and lower two standard errors away: it is 2 nats
-    lower if it is a parabola, and no lower where it rises for ever.
+    lower if it is a parabola, and no lower where it rises for ever. Towards an edge it may be next to level.
+
+    Parameters
+    ----------
+    bounded : ndarray of bool, shape (size, 2)
+        Whether a number far below and far above is next to an edge of its support.
 
     Returns
     -------
@@ -157,10 +220,14 @@ def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np
     if (values < -_SINGULAR).any():
         return covariance, groups
     flat = values <= _SINGULAR
+    if found.converged:
+        scaled = unit[:, None] * vectors
+        for k in np.flatnonzero(~flat & (values < _DOUBTFUL)):
+            flat[k] = _is_ridge(objective, found, rest, scaled, values, int(k))
     for k in np.flatnonzero(~flat) if found.converged else ():
         step = np.zeros(size)
         step[rest] = 2.0 * unit * vectors[:, k] / np.sqrt(values[k])
-        flat[k] = any(not objective.value(at) < found.value - _FALL for at in (u - step, u + step))
+        flat[k] = _rises(objective, found, step, bounded, np.abs(vectors[:, k]) > 0.1, rest)
     takes_part = np.abs(vectors[:, flat]) > 0.1
     groups += [rest[own] for own in takes_part.T]
     inner = (vectors[:, ~flat] / values[~flat]) @ vectors[:, ~flat].T * np.outer(unit, unit)
@@ -171,6 +238,56 @@ def told_part(objective: Objective, found: Maximum) -> tuple[np.ndarray, list[np
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _rises(
+    objective: Objective,
+    found: Maximum,
+    step: np.ndarray,
+    bounded: np.ndarray,
+    large: np.ndarray,
+    rest: np.ndarray,
+) -> bool:
+    """Whether the objective does not fall two standard errors away, to where there is no edge."""
+    falls = found.value - np.array([objective.value(found.u + s * step) for s in (-1.0, 1.0)])
+    fell = falls > _FALL
+    if fell.all() or not fell.any():
+        return not fell.all()
+    (side,) = np.flatnonzero(~fell)
+    up = (step[rest[large]] > 0) == (side == 1)
+    return not (falls[side] > 0 and bounded[rest[large], up.astype(int)].all())
+
+
+def _is_ridge(
+    objective: Objective,
+    found: Maximum,
+    rest: np.ndarray,
+    scaled: np.ndarray,
+    values: np.ndarray,
+    k: int,
+) -> bool:
+    """Whether the objective stays level along a direction of little curvature, where others follow.
+
+    Curvatures are differences, whose rounding may be more than a small one.
+    """
+    steep = np.flatnonzero(values >= _DOUBTFUL)
+    length = min(1.0, 0.5 / np.abs(scaled[:, k]).max())
+    falls = []
+    for side in (-length, length):
+        u = found.u.copy()
+        u[rest] += side * scaled[:, k]
+        height = objective.value(u)
+        for _ in range(_FOLLOWS):
+            along = scaled[:, steep].T @ objective.gradient(u)[rest]
+            new = u.copy()
+            new[rest] += scaled[:, steep] @ (along / values[steep])
+            higher = objective.value(new)
+            if not higher > height + 1e-9 * (1.0 + abs(height)):
+                break
+            u, height = new, higher
+        falls.append(found.value - height)
+    noise = 1e-9 * (1.0 + abs(found.value))
+    return bool(max(falls) <= 0.5 * _SINGULAR * length**2 + noise)
 
 
 class _Climb(NamedTuple):
@@ -201,14 +318,15 @@ def _climbed(
     for k in range(_ROUNDS):
         settled = _settle(objective, u)
         before = objective.value(u)
-        found = minimize(
-            lambda at: min(-objective.value(at), 1e300),
-            u,
-            jac=lambda at: -objective.gradient(at),
-            method="BFGS",
-            callback=note,
-            options={"gtol": tolerance, "maxiter": most - steps},
-        )
+        with np.errstate(all="ignore"):  # of steps that run off
+            found = minimize(
+                lambda at: min(-objective.value(at), 1e300),
+                u,
+                jac=lambda at: -objective.gradient(at),
+                method="BFGS",
+                callback=note,
+                options={"gtol": tolerance, "maxiter": most - steps},
+            )
         u, steps = found.x, steps + int(found.nit)
         if not settled or steps >= most or (k and -found.fun < before + _GAIN):
             break
@@ -221,36 +339,10 @@ def _settle(objective: Objective, u: np.ndarray) -> bool:
     return bool(settle is not None and settle(u))
 
 
-def _polished(objective: Objective, climb: _Climb, ends: np.ndarray) -> Maximum:
-    """Newton's steps at the end, as long as they rise: quasi-Newton ones stop where differences are rough."""
-    u, value, history, steps = climb
-    for _ in range(8):
-        slope, hessian = objective.gradient(u), curvature(objective, u)
-        rise, step = _newton(slope, hessian)
-        if not rise > 1e-10:
-            break
-        new = u + step
-        higher = objective.value(new)
-        if not higher > value:
-            break
-        u, value, steps = new, higher, steps + 1
-        history = np.append(history, higher)
-    ends = np.append(max(ends[0], value), ends[1:])
-    return Maximum(u, value, history, hessian, rise, steps, ends)
-
-
-def _newton(slope: np.ndarray, hessian: np.ndarray) -> tuple[float, np.ndarray]:
-    """How far Newton's step would rise, and the step, along directions that are curved.
-
-    Along others (a number at the edge of its support, an angle of no account) the slope must be next to none.
-    """
-    nothing = float("nan"), np.zeros(len(slope))
-    if not np.isfinite(hessian).all():
-        return nothing
-    values, vectors = np.linalg.eigh(-hessian)
-    told = values > max(_FLAT, 1e-9 * values.max(initial=0.0))
-    along = vectors.T @ slope
-    if (values < -_FLAT).any() or (np.abs(along[~told]) > _SLOPE).any():
-        return nothing
-    step = along[told] / values[told]
-    return float(0.5 * along[told] @ step), vectors[:, told] @ step
+def _maximum(objective: Objective, climb: _Climb, ends: np.ndarray) -> Maximum:
+    """The end of a climb, polished."""
+    none = np.zeros((0, 0))
+    return polished(
+        objective,
+        Maximum(climb.u, climb.value, climb.history, none, float("nan"), climb.steps, ends),
+    )

@@ -91,6 +91,11 @@ def maximised(
     return Learned(tables, log_likelihood, history[-1], np.array(history), converged, errors)
 
 
+def inside(table: np.ndarray) -> np.ndarray:
+    """Which entries are not at an edge, 0 or 1."""
+    return (table > 1e-6) & (table < 1 - 1e-6)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -147,8 +152,8 @@ def _errors(expected: Expected, tables: Tables, counts: Mapping[str, np.ndarray]
 
     Louis (1982), JRSS B 44, eq. 3.1; entries at the edge, and rows with one entry inside, have none.
     """
-    inside = {n: (t > 1e-6) & (t < 1 - 1e-6) for n, t in tables.items()}
-    size = sum(int(mask.sum()) for mask in inside.values())
+    within = {n: inside(t) for n, t in tables.items()}
+    size = sum(int(mask.sum()) for mask in within.values())
     unknown = {n: np.full(t.shape, np.nan) for n, t in tables.items()}
     if not 0 < size <= _MOST:
         return unknown
@@ -158,7 +163,7 @@ def _errors(expected: Expected, tables: Tables, counts: Mapping[str, np.ndarray]
         parts = []
         for n, table in at.items():
             seen = found[n] + counts[n]
-            parts.append((seen - seen.sum(axis=-1, keepdims=True) * table)[inside[n]])
+            parts.append((seen - seen.sum(axis=-1, keepdims=True) * table)[within[n]])
         return np.concatenate(parts)
 
     def moved(k: int, step: float) -> Tables:
@@ -166,8 +171,8 @@ def _errors(expected: Expected, tables: Tables, counts: Mapping[str, np.ndarray]
         shift[k], start = step, 0
         for n, table in tables.items():
             own = np.zeros(table.shape)
-            many = int(inside[n].sum())
-            own[inside[n]] = shift[start : start + many]
+            many = int(within[n].sum())
+            own[within[n]] = shift[start : start + many]
             start += many
             new = table * np.exp(own)
             at[n] = new / new.sum(axis=-1, keepdims=True)
@@ -181,8 +186,8 @@ def _errors(expected: Expected, tables: Tables, counts: Mapping[str, np.ndarray]
     values, vectors = np.linalg.eigh(information)
     told = values > 1e-7 * max(values.max(), 1e-300)
     covariance = (vectors[:, told] / values[told]) @ vectors[:, told].T
-    lost = _untold(information, values, vectors, tables, inside)
-    return _spread(covariance, lost, tables, inside)
+    lost = _untold(information, values, vectors, tables, within)
+    return _spread(covariance, lost, tables, within)
 
 
 def _untold(

@@ -23,10 +23,12 @@ from bayesmc.errors import (
     UnsupportedError,
     did_you_mean,
 )
-from bayesmc.learning.climbing import Maximum, maximum, told_part
+from bayesmc.learning.climbing import maximum, told_part
+from bayesmc.learning.edges import Settled, bounded, settled
 from bayesmc.learning.fitted import Fit, lonely
 from bayesmc.learning.objectives import Density, Evidence, Objective, hidden_numbers
 from bayesmc.learning.series_evidence import of_template
+from bayesmc.learning.standard_errors import covariance_of, why_not
 from bayesmc.learning.tables import Climb, fit_tables
 from bayesmc.learning.unknowns import Unknowns
 from bayesmc.network import BayesNet, Problem, pose
@@ -110,16 +112,18 @@ def fit(
     Warns
     -----
     ConvergenceWarning
-        It ended before a maximum, at an edge, or where the curvature is singular: the data do not tell a
-        number or a combination of several, or it ran off. They are named, and have no standard error. Or no
-        other climb came as high, so that there may be higher ones.
+        It ended before a maximum, or where the curvature is singular: the data do not tell a number or a
+        combination of several, or it ran off. They are named, and have no standard error. Or no other climb
+        came as high, so that there may be higher ones.
 
     Notes
     -----
     Nodes are found by quasi-Newton steps on the log evidence in unconstrained coordinates, with the gradient
     of the expression graph where everything else hidden is finite, and by differences of exact evidences
-    elsewhere; standard errors are those of the observed information. Tables are found by expectation-
-    maximisation with extrapolated steps, whose objective never falls.
+    elsewhere; standard errors are those of the observed information. An estimate at the edge of its support
+    is a maximum where the objective is lower inside: it is named in ``at_edge``, has no standard error, and
+    is held for those of the others. Tables are found by expectation-maximisation with extrapolated steps,
+    whose objective never falls.
 
     References
     ----------
@@ -163,7 +167,8 @@ def fit(
     starts = _starts(unknowns, start, np.random.default_rng(seed_sequence(rng)), restarts)
     with Progress(None, "fit", progress) as bar:
         found = maximum(objective, starts, tolerance, max_iterations, restarts, bar)
-    return _fitted(net, objective, unknowns, found, prior)
+        end = settled(objective, unknowns, found, tolerance, max_iterations)
+    return _fitted(net, unknowns, end, prior)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -345,75 +350,30 @@ def _starts(
     return np.array([unknowns.numbers({**unknowns.values(u), **start}) for u in drawn])
 
 
-def _fitted(
-    net: BayesNet | DynamicBayesNet,
-    objective: Objective,
-    unknowns: Unknowns,
-    found: Maximum,
-    prior: bool,
-) -> Fit:
-    values = unknowns.values(found.u)
-    told, untold = told_part(objective, found)
-    covariance = _covariance(unknowns, found, told)
+def _fitted(net: BayesNet | DynamicBayesNet, unknowns: Unknowns, end: Settled, prior: bool) -> Fit:
+    values, found = unknowns.values(end.u), end.found
+    told, untold = told_part(end.objective, found, bounded(unknowns)[end.free])
+    covariance = covariance_of(unknowns, end, told)
     spread = np.sqrt(np.diagonal(covariance))
     errors, at = {}, 0
     for name, value in values.items():
         errors[name] = spread[at : at + value.size].reshape(value.shape)
         at += value.size
+    untold = [np.flatnonzero(end.free)[group] for group in untold] + end.untold
+    labels = unknowns.labels()
     if not found.converged or untold:
-        _warn(unknowns, found, untold, spread, prior)
+        lost = [x for x, e in zip(labels, spread, strict=True) if not np.isfinite(e)]
+        told_why = why_not(unknowns, found.steps, untold, lost, prior)
+        warnings.warn(told_why, ConvergenceWarning, stacklevel=3)
     elif (alone := lonely(found.ends)) is not None:
         warnings.warn(f"fit: {alone}", ConvergenceWarning, stacklevel=3)
     what = "posterior mode" if prior else "maximum likelihood"
-    log_prior = unknowns.log_prior(found.u) if prior else 0.0
+    log_prior = unknowns.log_prior(end.u) if prior else 0.0
     return Fit(
         _filled(net, values), values, errors, found.value - log_prior, found.value, found.history,
-        found.converged and not untold, found.steps, what, covariance, tuple(unknowns.labels()),
-        found.ends,
+        found.converged and not untold, found.steps, what, covariance, tuple(labels), found.ends,
+        tuple(labels[k] for k in end.labels),
     )  # fmt: skip
-
-
-def _warn(
-    unknowns: Unknowns, found: Maximum, untold: list[np.ndarray], spread: np.ndarray, prior: bool
-) -> None:
-    """That this is no maximum, or none that the data tell, and in which numbers."""
-    remedy = "priors that say more" if prior else "prior=True with priors that say more"
-    if untold:
-        of = "posterior density" if prior else "likelihood"
-        flat = "; ".join(unknowns.direction(group) for group in untold[:4])
-        more = "; and more" if len(untold) > 4 else ""
-        message = (
-            f"fit: at the estimate the {of} is next to flat in {flat}{more}: the data do not tell it, or it "
-            "runs to an edge or off to infinity (several with each other: only a combination of them); what "
-            f"is returned is one point of many; observe more, simplify the model, or use {remedy}"
-        )
-    else:
-        edge = [x for x, e in zip(unknowns.labels(), spread, strict=True) if not np.isfinite(e)]
-        at = f" {', '.join(edge[:4])} may run to an edge:" if edge else ""
-        message = (
-            f"fit: the climb ended after {found.steps} steps before a maximum:{at} look at history, give "
-            f"start=, or use {remedy}"
-        )
-    warnings.warn(message, ConvergenceWarning, stacklevel=4)
-
-
-def _covariance(unknowns: Unknowns, found: Maximum, covariance: np.ndarray) -> np.ndarray:
-    """Of the values, by the delta method; NaN where the curvature is none of a maximum's."""
-    size = unknowns.size
-    jacobian = np.empty((len(unknowns.flat(found.u)), size))
-    for k in range(size):
-        step = 1e-6 * max(1.0, abs(found.u[k]))
-        at = np.array([found.u, found.u])
-        at[0, k] -= step
-        at[1, k] += step
-        jacobian[:, k] = (unknowns.flat(at[1]) - unknowns.flat(at[0])) / (2 * step)
-    with np.errstate(invalid="ignore"):
-        spread = np.where(np.isnan(covariance), 0.0, covariance)
-        result = jacobian @ spread @ jacobian.T
-        lost = (np.abs(jacobian) > 0) @ np.isnan(np.diagonal(covariance))
-    lost |= np.abs(jacobian).max(axis=1) < 1e-9  # at the edge for good
-    result[lost], result[:, lost] = np.nan, np.nan
-    return result
 
 
 def _filled(

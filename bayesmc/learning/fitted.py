@@ -60,6 +60,9 @@ class Fit:
     labels : tuple of str
     climbs : ndarray
         The objective where each climb, or EM, ended, highest first; what is returned is the first.
+    at_edge : tuple of str
+        Numbers that lie at the edge of their support, and have no standard error; those of the others are
+        with these held.
 
     Examples
     --------
@@ -84,6 +87,7 @@ class Fit:
     covariance: np.ndarray | None = field(default=None, repr=False)
     labels: tuple[str, ...] = ()
     climbs: np.ndarray = field(default_factory=lambda: np.zeros(0), repr=False)
+    at_edge: tuple[str, ...] = ()
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.values:
@@ -132,6 +136,9 @@ class Fit:
         told = f"log likelihood {self.log_likelihood:.4f}, {how} after {self.iterations} iterations"
         if len(self.climbs) > 1:
             told += f"; {agreeing(self.climbs)} of {len(self.climbs)} climbs ended there"
+        if self.at_edge:
+            more = " and others" if len(self.at_edge) > 6 else ""
+            told += f"; at its edge: {', '.join(self.at_edge[:6])}{more}"
         return f"{self.method}: {told}"
 
     def __repr__(self) -> str:

@@ -92,13 +92,15 @@ class Density:
         self.with_prior, self.size = with_prior, density.size
 
     def value(self, u: np.ndarray) -> float:
-        found = float(self.density.value(self._own(u))) + self.constant
+        with np.errstate(all="ignore"):
+            found = float(self.density.value(self._own(u))) + self.constant
         found = found if self.with_prior else found - self.unknowns.log_prior(u)
         return found if np.isfinite(found) else -np.inf
 
     def gradient(self, u: np.ndarray) -> np.ndarray:
         slope = np.empty(self.size)
-        slope[self._order] = self.density.with_gradient(self._own(u))[1]
+        with np.errstate(all="ignore"):
+            slope[self._order] = self.density.with_gradient(self._own(u))[1]
         if self.with_prior:
             return slope
         return slope - differences(self.unknowns.log_prior, u)

@@ -18,7 +18,13 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.learning.cases import MISSING, Cases
-from bayesmc.learning.expectation_maximisation import Expected, Learned, Tables, maximised
+from bayesmc.learning.expectation_maximisation import (
+    Expected,
+    Learned,
+    Tables,
+    inside,
+    maximised,
+)
 from bayesmc.learning.fitted import Fit, lonely
 from bayesmc.learning.series_counts import SeriesCounts
 from bayesmc.network import BayesNet, CompiledNode, Model
@@ -51,7 +57,7 @@ def fit_tables(
         begin = {n: _begin(n, t, start) for n, t in series.tables().items()}
         _check_names(start, begin)
         found, ends = _highest(series.expected, begin, start, counts, climb)
-        return _fit(series.filled(found.tables), found, counts, ends)
+        return _fit(series.filled(found.tables), found, begin, counts, ends)
     if inputs:
         raise UnsupportedError("fit: tables are learned of nets without inputs; leave inputs= out")
     model = net.model()
@@ -89,7 +95,7 @@ def fit_tables(
         for n, d in net.declarations.items()
     }
     filled = BayesNet.of(net.name, declarations, net._plates)
-    return _fit(filled, found, counts, ends)
+    return _fit(filled, found, begin, counts, ends)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -132,7 +138,7 @@ def _highest(
     return best, np.sort([each.objective for each in found])[::-1]
 
 
-def _fit(filled: Any, found: Learned, counts: Any, ends: np.ndarray) -> Fit:
+def _fit(filled: Any, found: Learned, begin: Tables, counts: Any, ends: np.ndarray) -> Fit:
     if not found.converged:
         warnings.warn(
             f"fit: EM still rose by {found.history[-1] - found.history[-2]:.3g} nats in its last "
@@ -151,7 +157,17 @@ def _fit(filled: Any, found: Learned, counts: Any, ends: np.ndarray) -> Fit:
     return Fit(
         filled, found.tables, found.errors, found.log_likelihood, found.objective, found.history,
         found.converged, len(found.history) - 1, how, climbs=ends,
+        at_edge=_at_edge(found.tables, begin),
     )  # fmt: skip
+
+
+def _at_edge(tables: Tables, begin: Tables) -> tuple[str, ...]:
+    """Entries that were learned to be 0 or 1."""
+    found = []
+    for name, table in tables.items():
+        out = ~inside(table) & inside(begin[name])
+        found += [f"{name}[{', '.join(map(str, at))}]" for at in np.argwhere(out).tolist()]
+    return tuple(found)
 
 
 def _check_columns(data: Mapping[str, Any], model: Model) -> None:

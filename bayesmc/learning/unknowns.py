@@ -186,6 +186,22 @@ class Unknowns:
                 found += [own[k] for k in inside] if each else [p.node.name]
         return " with ".join(found[:4]) + (" and others" if len(found) > 4 else "")
 
+    def reads(self, positions: np.ndarray) -> np.ndarray:
+        """Which of all numbers of the values unconstrained numbers at positions move."""
+        found = []
+        for p in self.parts:
+            axes = len(p.transform.event_shape)
+            inside = np.isin(np.arange(p.start, p.stop), positions).reshape(p.shape)
+            each = p.shape == p.node.value_shape
+            if not each:
+                own = tuple(range(len(p.node.plate_shape), len(p.shape)))
+                inside = np.asarray(inside.any(axis=own))
+                inside = np.broadcast_to(
+                    inside.reshape(*inside.shape, *(1,) * axes), p.node.value_shape
+                )
+            found.append(inside.ravel())
+        return np.concatenate(found)
+
     def flat(self, u: np.ndarray) -> np.ndarray:
         """All numbers of the values at ``u``, in the order of ``labels``."""
         return np.concatenate([np.ravel(v) for v in self.values(u).values()])

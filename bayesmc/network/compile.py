@@ -164,6 +164,7 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
     except BayesmcError as error:
         if not node.links or node.declaration.source == "table" or _is_plain(error):
             raise
+<<<<<<< HEAD
         try:
             node.called(entry(node, model.probe, model.probe_shape))
         except BayesmcError as alone:
@@ -179,6 +180,33 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
             f"{str(error).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
             f"({instead}, axis=-1 for components), or declare vectorize=True (slow)"
         ) from error
+=======
+        whole = error
+    alone = _fault_alone(model, node)  # outside, so that no error shows twice
+    if alone is not None:
+        raise alone from alone.__cause__
+    if isinstance(whole, PlateError):  # which names the parent, and what to do about it
+        raise whole from whole.__cause__
+    sizes = sizes_in(str(whole.__cause__), model.probe_shape)
+    around = data_around(node.declaration, node.plate_shape, sizes)
+    if around is not None:
+        raise BroadcastError(f"node {node.name!r}: {around}") from whole
+    instead = "np.exp for math.exp" if "Python scalars" in str(whole) else "np.where for if"
+    raise BroadcastError(
+        f"node {node.name!r} works on one value at a time but not on arrays of them: "
+        f"{str(whole).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
+        f"({instead}, axis=-1 for components), or declare vectorize=True (slow)"
+    ) from whole
+
+
+def _fault_alone(model: Model, node: CompiledNode) -> BayesmcError | None:
+    """What goes wrong on one entry of the probe, if anything."""
+    try:
+        node.called(entry(node, model.probe, model.probe_shape))
+    except BayesmcError as error:
+        return error
+    return None
+>>>>>>> fix-series
 
 
 def _picked_by_row(model: Model, node: CompiledNode, message: str) -> str | None:

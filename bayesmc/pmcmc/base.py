@@ -23,7 +23,7 @@ from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled
 from bayesmc.pmcmc.filters import Filter
 from bayesmc.pmcmc.trellis import Trellis
-from bayesmc.pmcmc.walk import ParameterWalk, prior_of
+from bayesmc.pmcmc.walk import PARTICLES, ParameterWalk, prior_of
 from bayesmc.structure.target import Target, Values, target_of
 
 #: draws of the static nodes from their prior before giving up
@@ -92,6 +92,20 @@ class ParticleEngine(ChainEngine):
         evaluated = (n for n in question.target.terms if n in problem.model.nodes)
         return refuse_unsampled(problem.model, given, name) or refuse_noiseless(
             problem.model, evaluated, name
+        )
+
+    def effort(self, problem: Problem) -> str:
+        """How many chains it would run, how long, and what its filters take: particles moved, in words."""
+        lengths = self.lengths(problem)
+        slices = len(self._question(problem).trellis.slices)
+        sweeps = lengths.warmup + lengths.draws * self.thinning
+        few, many = PARTICLES if self.particles is None else (self.particles, self.particles)
+        moved = slices * lengths.chains * sweeps
+        each = f"{few}" if few == many else f"{few} to {many}"
+        total = f"{few * moved:.1e}" if few == many else f"{few * moved:.1e} to {many * moved:.1e}"
+        return (
+            f"{super().effort(problem)}; each sweep filters {slices} slices by {each} particles in every "
+            f"chain: {total} particles moved in all"
         )
 
     def _question(self, problem: Problem) -> Question:

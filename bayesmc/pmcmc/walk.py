@@ -40,7 +40,7 @@ _ANEW, _FEW, _SELDOM = 0.5, 8, 0.1
 #: times the error to aim at, above which the warmup takes more particles than the first look said
 _MORE = 1.25
 #: particles of the first look, and how many are taken for the error of the log likelihood to aim at
-_PILOT, _PARTICLES = 100, (50, 5000)
+_PILOT, PARTICLES = 100, (50, 5000)
 #: degrees of freedom of such steps, and how much wider than what was learnt they are
 _DF, _WIDER = 5.0, 1.2
 
@@ -174,7 +174,7 @@ class ParameterWalk(BlockWalk):
             return moved, self.filter.particles
         best = points[np.argmin(np.square(points - weights @ points).sum(axis=1))]
         estimates = weigh(np.tile(best, (count, 1)))[1]
-        return moved, particles_for(estimates, _PILOT, self.filter.best, *_PARTICLES)
+        return moved, particles_for(estimates, _PILOT, self.filter.best, *PARTICLES)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -225,7 +225,7 @@ class ParameterWalk(BlockWalk):
         looks = np.concatenate([memory["looks"], apart[~np.isnan(apart)]])[-_KEPT:]
         error = float(np.median(looks)) / _MEDIAN if len(looks) else memory["error"]
         memory = {**memory, "error": error, "looks": looks}
-        least, most = _PARTICLES
+        least, most = PARTICLES
         if self.filter.chosen and error > _MORE * self.filter.best and memory["particles"] < most:
             wanted = memory["particles"] * (error / self.filter.best) ** 2
             memory |= {"particles": int(np.clip(wanted, least, most)), "looks": np.zeros(0)}

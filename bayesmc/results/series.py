@@ -222,9 +222,10 @@ class SeriesPosterior(SeriesChecks, MarginalAnswers, ShownSeries):
         mean = self._means[name]
         if np.any(self._variances[name] != 0):
             raise UnsupportedError(
-                f"quantile({name!r}): this result ({self.kind} by {type(self.engine).__name__}) knows means "
-                "and variances; ask for the mean of an event, queries={name: function}, or take a "
-                'ParticleFilter with keep="particles" or another engine'
+                f"{name!r} has no quantile, median, hdi, cdf, mode or entropy here: this result ({self.kind} "
+                f"by {type(self.engine).__name__}) knows its means and variances alone; ask for the mean of "
+                "an event, queries={name: function}, or take a ParticleFilter with "
+                'keep="particles" or another engine'
             )
         every = np.repeat(mean[:, None], levels.size, axis=1)
         return every.reshape((len(mean), *levels.shape, *mean.shape[1:]))

@@ -238,3 +238,23 @@ def test_errors_are_of_one_family_and_hold_their_facts():
     assert issubclass(errors.LowEssWarning, UserWarning)
     extra = errors.missing_extra("matplotlib", "plot")
     assert isinstance(extra, ImportError) and "pip install 'bayesmc[plot]'" in str(extra)
+
+
+def test_a_foreign_plate_among_constants_is_told_with_its_own_remedy() -> None:
+    """The parent's name, and ``.array``; no advice to put a reduction into the plate that it reduces."""
+    last = np.arange(5) == 4
+    net = bmc.BayesNet(plates={"item": 5})
+    net.add("free", bmc.Normal(0.0, 3.0), plates="item")
+    net.add("total", lambda free: (free * np.where(last, 0.0, 1.0)).sum("item"))
+    with pytest.raises(bmc.errors.PlateError, match=r"node 'total'.*use free\.array"):
+        net.model()
+
+
+def test_a_fault_that_one_value_has_too_is_told_once() -> None:
+    net = bmc.BayesNet(plates={"item": 5})
+    net.add("free", bmc.Normal(0.0, 3.0), plates="item")
+    net.add("first", lambda free: np.asarray(free)[0])
+    with pytest.raises(bmc.errors.PlateError, match="take free.array") as caught:
+        net.model()
+    cause = caught.value.__cause__
+    assert caught.value.__context__ is cause and cause.__context__ is None

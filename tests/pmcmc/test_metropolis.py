@@ -291,3 +291,20 @@ def test_refusals() -> None:
 
 def _run(engine: Any) -> Any:
     return bmc.infer(walk(), YS, engine=engine, rng=5)
+
+
+def test_explain_states_what_the_filters_take() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("scale", bmc.LogNormal(0.0, 0.5))
+    dbn.add("x", lambda x_prev, scale: bmc.Normal(x_prev, scale), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    seen = {"y": np.zeros(20)}
+    engine = bmc.ParticleMetropolis(draws=30, warmup=10, chains=4, particles=50)
+    told = bmc.explain(dbn, seen, engine=engine).effort
+    assert told.endswith(
+        "each sweep filters 20 slices by 50 particles in every chain: 1.6e+05 particles moved in all"
+    )
+    told = bmc.explain(dbn, seen, engine=bmc.ParticleMetropolis()).effort
+    assert told.endswith(
+        "by 50 to 5000 particles in every chain: 9.6e+06 to 9.6e+08 particles moved in all"
+    )

@@ -99,6 +99,10 @@ class SliceAnswers:
             self._check_question(term)
         return names, kinds
 
+    def stretches_of(self, name: str, more: float) -> list[tuple[int, int]]:
+        """Slices cut so that what is read of a node stays within bounds."""
+        return self._cut(self.plan.terms[name, 2], more)
+
     # ---- private ----------------------------------------------------------------------------
 
     def _table(self, name: str, node: CompiledNode) -> np.ndarray:

@@ -11,9 +11,12 @@ from bayesmc.dbn import Row, Series, Slices
 from bayesmc.engines.averages import as_event
 from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.discrete.answers import SliceAnswers
-from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.engines.discrete.mixtures import SliceMixtures
+from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import Observed
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.laws import Laws
+from bayesmc.results.posterior import quantile_levels
 
 #: rows that a slice may read: its own and two before
 _ROWS = 3
@@ -21,6 +24,9 @@ _ROWS = 3
 
 class DiscretePosterior(SeriesPosterior):
     """What a ``DiscreteFilter`` says of every slice: tables, means, and joint tables of two slices in a row.
+
+    Numbers whose density is known given the states (counts that are forecast, say) are exact mixtures of such
+    densities: ``cdf``, ``quantile``, ``hdi``, ``mode`` and ``entropy`` are theirs.
 
     Examples
     --------
@@ -35,14 +41,47 @@ class DiscretePosterior(SeriesPosterior):
     """
 
     _answers: SliceAnswers | None = None
+    #: the same, and of slices ahead, too
+    _source: SliceAnswers | None = None
 
     def read_from(self, answers: SliceAnswers) -> DiscretePosterior:
-        """With the beliefs that joint tables are worked out from."""
-        self._answers = answers
+        """With the beliefs that joint tables and mixtures are worked out from."""
+        self._answers = self._source = answers
         return self
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_answers": None}
+        return {**super().__getstate__(), "_answers": None, "_source": None}
+
+    def last(self, steps: int, kind: str) -> SeriesPosterior:
+        """The last so many slices by themselves."""
+        found = object.__new__(DiscretePosterior)
+        found.__dict__.update(super().last(steps, kind).__dict__)
+        found._source = self._source
+        return found
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
+        mixtures = None if self._is_known(name) else self._mixtures(name)
+        if mixtures is None:
+            return super().quantile(name, q)
+        levels = quantile_levels(name, q)
+        at = levels.reshape(-1, *(1,) * len(mixtures.shape))
+        found = mixtures.ppf(np.broadcast_to(at, (levels.size, *mixtures.shape)))
+        found = np.moveaxis(found, 0, 1)
+        return found.reshape(len(found), *levels.shape, *found.shape[2:])
+
+    def _held_laws(self, name: str) -> Laws:
+        mixtures = self._mixtures(name)
+        return super()._held_laws(name) if mixtures is None else mixtures.laws()
+
+    def _mixtures(self, name: str) -> SliceMixtures | None:
+        """A number in every slice as a mixture; None where it is none."""
+        if self._source is None:
+            return None
+        try:
+            return SliceMixtures(self._source, name, self.steps)
+        except UnsupportedError:
+            return None
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Means of a function of nodes of a slice, time first, its arguments with an axis of states first.
