@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, Plan
 from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
-from bayesmc.engines.mcmc.jointly import CROWD, continuous, density_of
+from bayesmc.engines.mcmc.jointly import CROWD, continuous, density_of, summed_with
 from bayesmc.expression import ordered
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
@@ -29,6 +29,8 @@ from bayesmc.structure.free_density import UnconstrainedDensity
 #: share of all numbers that have no closed form, at least; numbers of which a density is made to ask, at most
 _MOST_OF = 0.5
 _LARGEST = 4096
+#: joint states of the labels of an element that are summed over, at most
+_STATES = 16
 _ACCEPTED = 0.9
 #: nodes of an expression beyond which its arithmetic is slow in NumPy
 _LONG = 300
@@ -36,6 +38,9 @@ _LONG = 300
 
 def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCarlo, str] | None:
     """The engine that moves all numbers together, and why; None where a sweep is the better one.
+
+    Labels beside numbers without a closed form cling to these: the engine sums them out, where it can do so
+    element by element.
 
     Parameters
     ----------
@@ -45,20 +50,37 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
     """
     model = problem.model
     moved = {n for kernel in plan.kernels for n in kernel.names}
-    if any(model[n].is_discrete or model[n].domain is not None for n in moved):
+    labels = [n for n in moved if model[n].domain is not None]
+    if any(model[n].is_discrete for n in moved if n not in labels):
+        return None
+    if not all(model[n].plates for n in labels):
         return None
     if any(isinstance(kernel, BlockWalk) for kernel in plan.kernels):  # it may find another mode
         return None
-    sizes = {n: math.prod(model[n].value_shape) for n in moved}
-    slow = sum(sizes[n] for n in {n for k in plan.kernels if _is_slice(k) for n in k.names})
+    sizes = {n: math.prod(model[n].value_shape) for n in moved if n not in labels}
+    of_slices = (Slice, FactorSlice, Hamiltonian) if labels else (Slice, FactorSlice)
+    slow = sum(
+        sizes.get(n, 0) for n in {n for k in plan.kernels if _is(k, of_slices) for n in k.names}
+    )
     total = sum(sizes.values())
-    if not CROWD < slow or slow < _MOST_OF * total or total > _LARGEST:
+    few = 0 if labels else CROWD
+    if not few < slow or slow < _MOST_OF * total or total > _LARGEST:
         return None
-    engine = HamiltonianMonteCarlo(target_accept=_ACCEPTED)
+    engine = HamiltonianMonteCarlo(target_accept=_ACCEPTED, marginalize=bool(labels))
+    numbers = continuous(plan.target)
+    if labels and not _are_apart(problem, numbers, len(labels)):
+        return None
     if engine.refusal(problem) is not None:
         return None
-    if not _is_compiled(problem, density_of(problem, continuous(plan.target)), engine):
+    if not _is_compiled(problem, density_of(problem, numbers, engine.summed(problem)), engine):
         return None
+    if labels:
+        shown = ", ".join(map(repr, sorted(labels)))
+        return (
+            engine,
+            f"{shown} {'is' if len(labels) == 1 else 'are'} summed out, element by element: drawn in turn, "
+            f"labels and the {slow} numbers without a closed form would hold each other",
+        )
     return (
         engine,
         f"{slow} of {total} numbers have no closed form, and a sweep would move them one by one",
@@ -88,7 +110,14 @@ def _is_compiled(problem: Problem, density: UnconstrainedDensity, engine: ChainE
     return "trajectories" in made.told
 
 
-def _is_slice(kernel: Kernel) -> bool:
-    return isinstance(
-        kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice)
-    )
+def _are_apart(problem: Problem, numbers: tuple[str, ...], count: int) -> bool:
+    """Whether so many finite nodes are all summed out, element by element, of few joint states."""
+    found = summed_with(problem, numbers)
+    if len(found) < count:
+        return False
+    tables = density_of(problem, numbers, found).tables
+    return all(len(t.listed) == 1 and 1 < len(t.states) <= _STATES for t in tables)
+
+
+def _is(kernel: Kernel, kinds: tuple[type, ...]) -> bool:
+    return isinstance(kernel.kernel if isinstance(kernel, Stacked) else kernel, kinds)

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, Never
 
 from bayesmc.auto.choosing import explained_series
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.base import Engine
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph
 
 
+@by_keyword
 def explain(
     net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Mapping[str, Any] | None = None,
     engine: Any = None,
-    *,
+    *beyond: Never,
     inputs: Mapping[str, Any] | None = None,
     question: str = "filter",
     keep: str | None = None,
@@ -63,6 +65,8 @@ def explain(
       because hidden nodes are finite or linear-Gaussian: induced width 0, ...bytes
       a  eliminated
     """
+    if beyond:
+        refuse_positions(explain, beyond)
     over_time = isinstance(engine, FilterEngine) or not isinstance(engine, Engine)
     if isinstance(net, DynamicBayesNet) and over_time:
         try:

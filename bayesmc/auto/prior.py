@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Never
 
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.network import BayesNet, Problem, read_inputs
@@ -13,10 +14,11 @@ from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
 
 
+@by_keyword
 def prior_predict(
     net: BayesNet | DynamicBayesNet,
     draws: int = 1000,
-    *,
+    *beyond: Never,
     inputs: Any = None,
     plates: Mapping[str, int] | None = None,
     steps: int | None = None,
@@ -61,6 +63,8 @@ def prior_predict(
     >>> prior["y"].shape, float(prior.std("y")[0].round())
     ((1, 4000, 3), 10.0)
     """
+    if beyond:
+        refuse_positions(prior_predict, beyond)
     if isinstance(net, DynamicBayesNet):
         if steps is None:
             raise ModelError(

@@ -18,7 +18,8 @@ from bayesmc.dbn.given import check_even, check_frame, check_steps, count_of, is
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network import Observed
-from bayesmc.network.evidence import checked_input, observe, warn_of_doubts
+from bayesmc.network.doubts import warn_of_doubts
+from bayesmc.network.evidence import checked_input, observe
 from bayesmc.network.labels import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration

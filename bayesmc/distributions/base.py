@@ -123,6 +123,9 @@ class Distribution:
     def log_prob_of(self, x: np.ndarray, present: np.ndarray) -> np.ndarray:
         raise faults.no_marginals(self)
 
+    def completed(self, *args: Any, **kwargs: Any) -> np.ndarray:
+        raise faults.no_marginals(self)
+
     @property
     def mean(self) -> np.ndarray:
         """Mean, shape ``batch_shape + event_shape``."""

@@ -196,4 +196,6 @@ def _looks_like(value: Any, named: list[str]) -> str:
     looks = "rng" if isinstance(value, int) else "engine"
     if isinstance(value, Mapping) or hasattr(value, "columns"):
         looks = "inputs"
+    elif isinstance(value, str) or (isinstance(value, (list, tuple)) and _holds_text(value)):
+        looks = "learn"  # names
     return looks if looks in named else named[0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,6 @@ from bayesmc.expression.graph import (
     gather,
     ordered,
     pick,
-    reshape,
 )
 
 Bounds = tuple[int, int]
@@ -66,36 +67,22 @@ def counted_from_end(index: Expression, size: int) -> Expression:
 
 
 def indexed(value: Expression, key: Any) -> Expression:
-    """``value[key]``."""
+    """``value[key]`` as NumPy has it, whole numbers that vary among the keys included.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import evaluate, leaf
+    >>> from bayesmc.expression.indexing import indexed
+    >>> found = indexed(leaf("x", (1, 3)), (..., 0, leaf("year", (4,), int)))
+    >>> evaluate([found], {"x": np.array([[5.0, 6.0, 7.0]]), "year": np.array([2, 0, 0, -1])})
+    [array([7., 5., 5., 7.])]
+    """
     keys = [_plain_key(k) for k in (key if isinstance(key, tuple) else (key,))]
     if not any(isinstance(k, Expression) for k in keys):
         at = np.arange(value.size).reshape(value.shape)[tuple(keys)]
         return pick([value], at)
-    if not isinstance(value, Constant):
-        raise TraceError(
-            "an array that varies is indexed by one that varies: gather along a plate, or use "
-            "np.take_along_axis"
-        )
-    computed = [n for n, k in enumerate(keys) if isinstance(k, Expression)]
-    lead = keys[: computed[-1] + 1]
-    if any(not isinstance(k, (Expression, int, np.integer)) for k in lead):
-        raise TraceError("a computed index stands behind a slice")
-    rows: Any = 0
-    for n, k in enumerate(lead):
-        size = value.shape[n]
-        at = as_expression(k)
-        if at.dtype.kind != "i":
-            raise TraceError("an index that is not a whole number")
-        at = within(counted_from_end(at, size), size)
-        rows = elementwise(np.add, elementwise(np.multiply, rows, size), at)
-    rest = value.shape[len(lead) :]
-    table = reshape(value, (-1, *rest)) if value.size else value
-    found = gather(table, rows)
-    left = tuple(keys[len(lead) :])
-    if not left:
-        return found
-    at = np.arange(found.size).reshape(found.shape)
-    return pick([found], at[(slice(None),) * len(rows.shape) + left])
+    return _looked_up(value, keys)
 
 
 def assigned(value: Expression, key: Any, new: Expression) -> Expression:
@@ -112,6 +99,60 @@ def assigned(value: Expression, key: Any, new: Expression) -> Expression:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _looked_up(value: Expression, keys: list[Any]) -> Expression:
+    """``value[keys]`` where some keys vary: one gather along the axes that these stand at."""
+    keys = [k if _is_basic(k) else as_expression(k) for k in keys]
+    if any(isinstance(k, Expression) and k.dtype.kind != "i" for k in keys):
+        raise TraceError("an index that is not a whole number")
+    numbers = [n for n, k in enumerate(keys) if _is_number(k)]
+    are_apart = numbers != list(range(numbers[0], numbers[-1] + 1))
+    keys = _expanded(keys, len(value.shape))
+    at = np.arange(value.size).reshape(value.shape)
+    at = at[tuple(slice(None) if isinstance(k, Expression) else k for k in keys)]
+    left = [k for k in keys if isinstance(k, Expression) or not _is_number(k)]
+    along = [n for n, k in enumerate(left) if isinstance(k, Expression)]
+    rest = [n for n in range(at.ndim) if n not in along]
+    rows: Expression | None = None
+    for n in along:
+        size = at.shape[n]
+        one = within(counted_from_end(left[n], size), size)
+        rows = (
+            one if rows is None else elementwise(np.add, elementwise(np.multiply, rows, size), one)
+        )
+    lead = math.prod(at.shape[n] for n in along)
+    at = at.transpose(along + rest).reshape(lead, *(at.shape[n] for n in rest))
+    found = gather(pick([value], at), rows)
+    before = list(takewhile(lambda k: not _is_number(k), keys))
+    ahead = 0 if are_apart else len(before)  # NumPy puts what numbers that stand apart pick first
+    if not ahead:
+        return found
+    ndim = len(found.shape) - len(rest)
+    order = np.arange(found.size).reshape(found.shape)
+    return pick([found], np.moveaxis(order, range(ndim), range(ahead, ahead + ndim)))
+
+
+def _is_basic(key: Any) -> bool:
+    """Whether a key picks by itself, whatever the others are."""
+    if isinstance(key, (bool, np.bool_)):
+        return False
+    return key is None or key is Ellipsis or isinstance(key, (slice, int, np.integer))
+
+
+def _is_number(key: Any) -> bool:
+    """Whether a key is no slice, new axis or ellipsis."""
+    return key is not None and key is not Ellipsis and not isinstance(key, slice)
+
+
+def _expanded(keys: list[Any], ndim: int) -> list[Any]:
+    """Keys with one for every axis."""
+    gaps = [n for n, k in enumerate(keys) if k is Ellipsis]
+    missing = ndim - sum(k is not None and k is not Ellipsis for k in keys)
+    if len(gaps) > 1 or missing < 0:
+        raise TraceError(f"an index of {len(keys)} parts into an array of {ndim} axes")
+    at = gaps[0] if gaps else len(keys)
+    return [*keys[:at], *[slice(None)] * missing, *keys[at + len(gaps) :]]
 
 
 def _plain_key(key: Any) -> Any:

@@ -128,8 +128,9 @@ class Components:
         seen = target.seen(name)
         if seen is None:
             return np.zeros(self.counts[name] * self.dims[name], bool)
-        assert seen.mask is not None
-        return np.repeat(seen.mask.reshape(-1), self.dims[name])
+        node = self.nodes[name]
+        numbers = seen.numbers(len(node.event_shape))
+        return np.broadcast_to(numbers, node.value_shape).reshape(-1)
 
 
 def order_of(components: Components) -> Order:
@@ -288,13 +289,7 @@ class BlockSums:
 
 def _known_part(target: Target, name: str) -> np.ndarray:
     """What was seen of a node, zero elsewhere, shape (1, *value)."""
-    node, seen = target.model[name], target.seen(name)
-    found = np.zeros((1, *node.value_shape))
-    if seen is not None:
-        assert seen.mask is not None
-        mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
-        found[0] = np.where(mask, seen.value, 0.0)
-    return found
+    return target.with_seen(name, np.zeros((1, *target.model[name].value_shape)))
 
 
 def _cost(order: Order) -> float:

@@ -15,6 +15,7 @@ from bayesmc.errors import DensityError, EngineWarning, TraceError
 from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.compiled_transition import CompiledTransition
 from bayesmc.kernels.hamiltonian_warmup import (
+    Bends,
     Metric,
     MetricLearning,
     StepSize,
@@ -127,6 +128,8 @@ class Hamiltonian(Kernel):
         self.threads, self.compiled, self.debug = threads, compiled, debug
         self._compiled: CompiledTransition | None = None
         self.step_size = StepSize(target_accept)
+        #: a warmup whose length is said learns for the acceptance that is said
+        self.bends = Bends() if warmup is None else None
         self.metric = MetricLearning(metric)
         self.ends = windows(warmup)
 
@@ -153,12 +156,14 @@ class Hamiltonian(Kernel):
         nobody = np.zeros(chains, dtype=bool)
         return {
             "place": {"u": u, "log": log, "slope": slope},
-            "values": {n: values[n] for n in self.names},
+            "values": {n: values[n] for n in self.density.names},
             "metric": self.metric.start(slope),
             "step": self.step_size.start(np.zeros(chains)),
             "machine": self._compiled is not None,
             "sweep": 0,
             "windows": 0,
+            "bends": np.zeros(2),
+            "raised": 0,
             "work": np.zeros(2),
             "accepted": np.zeros(chains),
             "moves": 0,
@@ -195,6 +200,10 @@ class Hamiltonian(Kernel):
 
     def end_warmup(self, memory: Memory) -> Memory:
         return {**memory, "step": self.step_size.frozen(memory["step"])}
+
+    def unsettled(self, memory: Memory) -> bool:
+        """Whether a warmup should not end yet: steps were found too long when its last window ended."""
+        return bool(memory["raised"] and memory["raised"] == memory["windows"])
 
     def energy_ratio(self, memory: Memory) -> np.ndarray:
         """E-BFMI of every chain: mean square step of the energy over its variance.
@@ -254,7 +263,9 @@ class Hamiltonian(Kernel):
     def _place(self, values: Values, memory: Memory, gradient: Gradient) -> Place:
         """Where the chains are: as the last step left them, or as somebody else has."""
         known, last = memory["place"], memory["values"]
-        same = all(values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.names)
+        same = all(
+            values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.density.names
+        )
         if same and not self.given:
             return Place(**known)
         u = known["u"] if same else self.density.unconstrain(values)
@@ -270,12 +281,12 @@ class Hamiltonian(Kernel):
     ) -> Memory:
         """The memory with dual averaging begun anew."""
         scale = Scale(memory["metric"]["root"])
-        step, target = memory["step"], self.step_size.target
+        step, target = memory["step"], memory["step"]["target"]
         log = step["log"]
         if pooled:
             log = np.full_like(log, log.mean())
         log = first_steps(gradient, place, log, scale, rng, target, pooled)
-        return {**memory, "step": self.step_size.start(log)}
+        return {**memory, "step": self.step_size.start(log, target)}
 
     def _learnt(
         self,
@@ -293,12 +304,27 @@ class Hamiltonian(Kernel):
             return memory
         if pooled:
             memory["metric"] = self.metric.learnt(memory["metric"], place.u)
+            memory = self._bent(memory)
         if sweep < self.ends[memory["windows"]]:
             return memory
         if pooled:
             memory["metric"] = self.metric.renewed(memory["metric"])
         memory["windows"] += 1
         return self._first_steps(gradient, place, memory, rng, pooled=True)
+
+    def _bent(self, memory: Memory) -> Memory:
+        """The memory with divergences of this window counted, and at its end a target nearer to 1, once."""
+        step, said = memory["step"], self.step_size.target
+        if self.bends is None or step["target"] != said:
+            return memory
+        sweep, (begun, end) = memory["sweep"], self.ends[memory["windows"] - 1 :][:2]
+        found = self.bends.seen(memory["bends"], memory["divergent"], sweep, begun, end)
+        if sweep < end:
+            return {**memory, "bends": found}
+        target = self.bends.target(found, said)
+        raised = memory["windows"] + 1 if target != said else 0
+        step = {**step, "target": target}
+        return {**memory, "bends": self.bends.start(), "step": step, "raised": raised}
 
 
 # ---- private ------------------------------------------------------------------------------------

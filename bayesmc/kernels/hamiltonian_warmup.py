@@ -31,6 +31,9 @@ _LEAST = 20
 _OPEN, _DOUBLINGS = 20, 20
 #: constants of dual averaging: shrinkage towards ten times the first step, early steps, decay
 _GAMMA, _EARLY, _KAPPA, _AHEAD = 0.05, 10.0, 0.75, math.log(10.0)
+#: trajectories that diverge by chance, their number and their share, at most; by how much the target of
+#: acceptance comes nearer to 1 where more do
+_DIVERGED, _NEARER = (2, 2e-3), 4.0
 #: doublings (or halvings) in search of a first step
 _SEARCH = 60
 #: draws that the metric from before counts for, and the share of it that it is shrunk towards
@@ -78,7 +81,8 @@ def windows(warmup: int | None) -> tuple[int, ...]:
 class StepSize:
     """Dual averaging of the logarithm of a step's length towards a mean acceptance.
 
-    A memory is a dict: ``log`` and ``average`` (chains,), ``centre``, ``bias`` (chains,), ``count``.
+    A memory is a dict: ``log`` and ``average`` (chains,), ``centre``, ``bias`` (chains,), ``count``, and the
+    ``target``.
 
     Parameters
     ----------
@@ -100,16 +104,17 @@ class StepSize:
     def __init__(self, target: float) -> None:
         self.target = target
 
-    def start(self, log: np.ndarray) -> dict[str, Any]:
-        """The memory before the first step, given a first length for each chain."""
+    def start(self, log: np.ndarray, target: float | None = None) -> dict[str, Any]:
+        """The memory before the first step, given a first length for each chain, and another target."""
         zeros = np.zeros_like(log)
-        return {"log": log, "average": log, "centre": log + _AHEAD, "bias": zeros, "count": 0}
+        return {"log": log, "average": log, "centre": log + _AHEAD, "bias": zeros, "count": 0,
+                "target": self.target if target is None else target}  # fmt: skip
 
     def learnt(
         self, memory: dict[str, Any], acceptance: np.ndarray, pooled: bool
     ) -> dict[str, Any]:
         """The memory after a sweep; ``pooled`` where all chains are to take the same step."""
-        error = self.target - np.where(np.isnan(acceptance), 0.0, acceptance)
+        error = memory["target"] - np.where(np.isnan(acceptance), 0.0, acceptance)
         if pooled:
             error = np.full_like(error, error.mean())
         count = memory["count"] + 1
@@ -125,6 +130,43 @@ class StepSize:
         log = memory["average"] if memory["count"] else memory["log"]
         log = np.full_like(log, log.mean())
         return {**memory, "log": log, "average": log}
+
+
+class Bends:
+    """Whether trajectories go on diverging in a warmup, so that shorter steps are to be learnt.
+
+    A memory is an array: trajectories that diverged in the later half of a window, and all of that half. A
+    density that bends more sharply in places than elsewhere asks for shorter steps than a mean acceptance
+    does; so the target comes nearer to 1, once.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.hamiltonian_warmup import Bends
+    >>> bends = Bends()
+    >>> memory = bends.seen(bends.start(), np.array([True, False, False, True]), sweep=9, begun=0, end=10)
+    >>> round(bends.target(memory, 0.8), 2), bends.target(bends.start(), 0.8)
+    (0.95, 0.8)
+    """
+
+    def start(self) -> np.ndarray:
+        """The memory at the beginning of a window."""
+        return np.zeros(2)
+
+    def seen(
+        self, memory: np.ndarray, divergent: np.ndarray, sweep: int, begun: int, end: int
+    ) -> np.ndarray:
+        """The memory after a sweep of a window that began after one sweep and ends after another."""
+        if 2 * sweep <= begun + end:
+            return memory
+        return np.asarray(memory + [divergent.sum(), divergent.size])
+
+    def target(self, memory: np.ndarray, target: float) -> float:
+        """The acceptance that steps are learnt for after a window."""
+        diverged, count = memory
+        if diverged < _DIVERGED[0] or diverged < _DIVERGED[1] * count:
+            return target
+        return 1.0 - (1.0 - target) / _NEARER
 
 
 def first_steps(

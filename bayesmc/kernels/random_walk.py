@@ -8,12 +8,13 @@ numbers of each stand in one vector is said here.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped, transform_of
 from bayesmc.errors import ShapeError
@@ -174,10 +175,16 @@ class AdaptiveWalk(Kernel):
         return ~self.blanket.node.support.contains(new)
 
 
-def some_support(model: Model, name: str) -> Support:
-    """The support of a node; if its bounds depend on parents, that for some values of these."""
+def some_support(model: Model, name: str, known: Mapping[str, np.ndarray] | None = None) -> Support:
+    """The support of a node; if its bounds depend on parents, that for some values of these.
+
+    Bounds may be out of order at these values: it is asked for its kind.
+    """
     support = model[name].support
-    return model.evaluate(name, model.probe)[0].support if support is None else support
+    if support is not None:
+        return support
+    with marking_invalid(), np.errstate(all="ignore"):
+        return model.evaluate(name, {**model.probe, **(known or {})})[0].support
 
 
 def walked(support: Support, event_shape: tuple[int, ...], unconstrained: bool) -> Transform:

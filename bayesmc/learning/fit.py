@@ -5,12 +5,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, pose_series
 from bayesmc.dbn.slices import SliceStore
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.question import free_density
 from bayesmc.engines.exact.exact import Exact
@@ -38,10 +39,11 @@ from bayesmc.structure.unconstrained import without_volume
 _STARTS = 32
 
 
+@by_keyword
 def fit(
     net: BayesNet | DynamicBayesNet,
     data: Any,
-    *,
+    *beyond: Never,
     inputs: Mapping[str, Any] | None = None,
     learn: str | Sequence[str] | None = None,
     prior: bool = False,
@@ -87,7 +89,7 @@ def fit(
     restarts : int, optional
         How many climbs are made, or how often EM begins; the highest end is taken, and ``climbs`` has them
         all. Starts are draws of the priors, of tables those of the net and then random rows. None: climbs go
-        on until two end at the same height, three at least and eight at most; EM begins once.
+        on until two have ended at the highest of all, three at least and eight at most; EM begins once.
     rng : seed, SeedSequence, Generator or None
         For starts.
     progress : bool, optional
@@ -134,6 +136,8 @@ def fit(
     >>> float(found["rate"].round(4)), float(found.std_errors["rate"].round(4))
     (2.5, 0.7906)
     """
+    if beyond:
+        refuse_positions(fit, beyond)
     if not isinstance(net, (BayesNet, DynamicBayesNet)):
         raise ModelError(f"fit: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}")
     _check_options(start, max_iterations, restarts)

@@ -61,11 +61,56 @@ def sizes_in(message: str, batch: Shape) -> set[int]:
     >>> sizes_in("operands could not be broadcast together with shapes (3,2) (5,)", (3, 2))
     {5}
     """
-    if "broadcast" not in message and "mismatch" not in message:
-        return set()
-    found = re.findall(r"\(((?:\d+,? ?)+)\)", message)
-    shapes = [tuple(int(n) for n in re.findall(r"\d+", shape)) for shape in found]
-    return {n for shape in shapes if shape[: len(batch)] != batch for n in shape}
+    return {n for shape in _shapes_in(message) if shape[: len(batch)] != batch for n in shape}
+
+
+def picked_by_row(
+    plates: Mapping[str, int], vectors: Mapping[str, Shape], batch: Shape, message: str
+) -> str | None:
+    """What to write where an array over plates has picked components of a vector parent, and adds an axis.
+
+    Parameters
+    ----------
+    plates : mapping
+        Of the node, with their sizes.
+    vectors : mapping
+        Vector parent -> its shape as it arrives, behind the batch.
+    batch : tuple of int
+    message : str
+        It tells the shape that does not fit.
+
+    Examples
+    --------
+    >>> from bayesmc.network.clashing import picked_by_row
+    >>> picked_by_row({"row": 7}, {"beta": (1, 3)}, (3, 2), "batch shape (3, 2, 1, 7)")[:59]
+    "its parent 'beta' is a vector and arrives as (*batch, 1, 3)"
+    """
+    over = tuple(plates.values())
+    for shape in _shapes_in(message):
+        for name, arrives in vectors.items():
+            own, rest = (*batch, *arrives[:-1]), shape[len(batch) :]
+            told = f"its parent {name!r} is a vector and arrives as (*batch, {', '.join(map(str, arrives))})"
+            if (
+                batch
+                and shape[: len(batch)] == batch
+                and rest[-len(batch + over) :] == batch + over
+            ):
+                return (
+                    f"{told}; {name}[..., k] with a k that has a batch of its own pairs every value of one "
+                    f"with every value of the other: let the components be a plate and write {name}[k]"
+                )
+            added = shape[len(own) :]
+            if not added or shape != own + added or added != over[len(over) - len(added) :]:
+                continue
+            each = ", ".join(f"np.arange({n})" if n > 1 else "0" for n in arrives[:-1])
+            by_plate = f", or let the components be a plate and write {name}[k]"
+            return (
+                f"{told}, plates before components; {name}[..., k] with an array k over "
+                f"{' and '.join(map(repr, plates))} keeps the axes of both, shape {shape}. Write "
+                f"{name}[..., {each}, k] for each element's component k, {name}[..., 0] for the first "
+                f"component of all{by_plate if max(arrives[:-1]) == 1 else ''}"
+            )
+    return None
 
 
 def sizes_beyond(shape: Shape, target: Shape) -> set[int]:
@@ -139,6 +184,14 @@ def refuse_misplaced(net: Any, evidence: Mapping[str, Any], inputs: Any) -> None
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _shapes_in(message: str) -> list[Shape]:
+    """The shapes in what is said of some that do not broadcast."""
+    if not any(word in message for word in ("broadcast", "mismatch", "batch shape")):
+        return []
+    found = re.findall(r"\(((?:\d+,? ?)+)\)", message)
+    return [tuple(int(n) for n in re.findall(r"\d+", shape)) for shape in found]
 
 
 def _data_shape(value: Any) -> Shape:

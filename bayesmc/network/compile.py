@@ -22,7 +22,7 @@ from bayesmc.errors import (
     StateError,
 )
 from bayesmc.network.calling import Aligner, RowAligner
-from bayesmc.network.clashing import data_around, sizes_in
+from bayesmc.network.clashing import data_around, picked_by_row, sizes_in
 from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
@@ -144,7 +144,13 @@ def _discover(
         result, batch = _called(model, bare)
     if not isinstance(result, Distribution):
         return _deterministic(model, bare, result, batch, possible)
-    node = _stochastic(bare, result, batch)
+    try:
+        node = _stochastic(bare, result, batch)
+    except ShapeError as error:
+        picked = _picked_by_row(model, bare, str(error))
+        if picked is None:
+            raise
+        raise ShapeError(f"node {bare.name!r}: {picked}") from error
     value = reachable(node, result, model.probe_shape, count, rng)
     if not possible:
         refuse_parameters(node, result, probe, batch)
@@ -164,6 +170,7 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
             raise alone from alone.__cause__
         sizes = sizes_in(str(error.__cause__), model.probe_shape)
         around = data_around(node.declaration, node.plate_shape, sizes)
+        around = around or _picked_by_row(model, node, str(error.__cause__))
         if around is not None:
             raise BroadcastError(f"node {node.name!r}: {around}") from error
         instead = "np.exp for math.exp" if "Python scalars" in str(error) else "np.where for if"
@@ -172,6 +179,18 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
             f"{str(error).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
             f"({instead}, axis=-1 for components), or declare vectorize=True (slow)"
         ) from error
+
+
+def _picked_by_row(model: Model, node: CompiledNode, message: str) -> str | None:
+    """What to write where components of a vector parent are picked beside the plates."""
+    sizes = dict(zip(node.plates, node.plate_shape, strict=True))
+    vectors = {}
+    for parent, link in node.links:
+        if len(model.nodes[parent].event_shape) == 1 and sizes and not link.foreign:
+            above = model.nodes[parent]
+            own = (n if p in above.plates else 1 for p, n in sizes.items())
+            vectors[parent] = (*own, *above.event_shape)
+    return picked_by_row(sizes, vectors, model.probe_shape, message)
 
 
 def _is_plain(error: BayesmcError) -> bool:

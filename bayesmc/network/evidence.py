@@ -6,8 +6,6 @@ entries are settled here once, so that engines never look at user values.
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -15,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
+from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network.clashing import many_axes, refuse_misplaced, surplus
 from bayesmc.network.labels import by_label, oriented, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
@@ -24,9 +22,6 @@ from bayesmc.shapes import Shape, at_index, first_index
 
 _NO_READING = "put in what stands for no reading (of ranges: robotics.clean_ranges)"
 _ARTICLE = {"deterministic": "a deterministic", "input": "an input", "fixed": "a fixed (do)"}
-_FULL_TURN = 2 * math.pi * (1 + 1e-6)
-#: share of angles beyond a full turn from which on they are no slips, and what degrees do not go beyond
-_MANY, _DEGREES = 0.25, 361.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +42,12 @@ class Observed:
     value: np.ndarray
     mask: np.ndarray | None = None
     parts: np.ndarray | None = None
+
+    def numbers(self, event_ndim: int) -> np.ndarray:
+        """Which numbers were seen, those of vectors seen in part included; it broadcasts to values."""
+        mask = np.asarray(True if self.mask is None else self.mask)
+        mask = np.expand_dims(mask, tuple(range(mask.ndim, mask.ndim + event_ndim)))
+        return mask if self.parts is None else mask | self.parts
 
 
 def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str, Observed]:
@@ -99,12 +100,10 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
         )
     if every.all() and array.size:
         return None
-    filled = array
-    if missing.any():
-        filled = np.where(missing, array[first_index(~missing)], array)
+    filled = np.where(missing, array[first_index(~missing)], array) if missing.any() else array
     stored = store(node, filled)
     observed = np.asarray(~some)
-    _check_support(node, stored, np.asarray(~every))
+    _check_support(node, stored, np.asarray(~every), observed)
     parts = np.expand_dims(partly, event) & ~missing if partly.any() else None
     return Observed(stored, None if observed.all() else observed, parts)
 
@@ -303,7 +302,9 @@ def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:
     return array, missing if masked is None else missing | masked
 
 
-def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray) -> None:
+def _check_support(
+    node: CompiledNode, stored: np.ndarray, observed: np.ndarray, whole: np.ndarray
+) -> None:
     event = tuple(range(len(node.plate_shape), stored.ndim))
     if stored.dtype.kind == "f":
         bad = ~np.isfinite(stored) & np.expand_dims(observed, event)
@@ -320,7 +321,8 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
         return
     inside = np.asarray(support.contains(stored))
     alone = bool(event) and support.event_ndim == 0  # an interval, for every component of a vector
-    outside = ~inside & (np.expand_dims(observed, event) if alone else observed)
+    # what fills a vector that was seen in part need not be in its support
+    outside = ~inside & (np.expand_dims(observed, event) if alone else whole)
     if outside.any():
         at = first_index(outside)
         raise EvidenceError(
@@ -385,62 +387,3 @@ def _close(name: str, model: Model) -> str:
 
 def _some(names: list[str]) -> str:
     return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
-
-
-def warn_of_doubts(model: Model, name: str, found: Observed | None) -> None:
-    """Look at what was observed of one node.
-
-    Warns
-    -----
-    EvidenceWarning
-        It is possible, but looks like degrees, or as its density says (``doubt`` of a distribution).
-    """
-    if found is None or model[name].angles is None:
-        return
-    values = found.value if found.mask is None else found.value[found.mask]
-    doubt = _doubt(model, name, values) or _degrees(model[name], values)
-    if doubt is not None:
-        warnings.warn(f"evidence on {name!r}: {doubt}", EvidenceWarning, stacklevel=2)
-
-
-def warn_of_nothing(observed: Mapping[str, Observed]) -> None:
-    """Look whether the evidence has any values at all.
-
-    Warns
-    -----
-    EvidenceWarning
-        All of it are empty arrays, so that plates have size 0.
-    """
-    if observed and not any(found.value.size for found in observed.values()):
-        warnings.warn(
-            f"evidence on {', '.join(map(repr, observed))} is empty (size 0): nothing is learned from it, "
-            "and the answer is the prior",
-            EvidenceWarning,
-            stacklevel=2,
-        )
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _doubt(model: Model, name: str, values: np.ndarray) -> str | None:
-    """What the density itself finds strange."""
-    try:
-        dist = model.evaluate(name, model.probe)[0]
-    except BayesmcError:  # of parameters that are out of range; engines say so where it counts
-        return None
-    look = getattr(dist, "doubt", None)
-    return None if look is None else look(values)
-
-
-def _degrees(node: CompiledNode, values: np.ndarray) -> str | None:
-    """Whether angles go beyond a full turn, as those in degrees do."""
-    angles = np.abs(values[..., node.angles] if node.event_shape else values)
-    beyond = angles > _FULL_TURN
-    if not angles.size or beyond.mean() < _MANY or angles.max() > _DEGREES:
-        return None  # what goes beyond 361, too, was unwrapped by somebody
-    return (
-        f"angles are in radians, and {int(beyond.sum())} of {angles.size} lie beyond a full turn (the "
-        f"largest is {angles.max():.4g}); of degrees give np.deg2rad(...), of turns that add up "
-        "np.remainder(..., 2 * np.pi)"
-    )

@@ -326,8 +326,9 @@ def refuse_parts(observed: Mapping[str, Observed], who: str) -> str | None:
         if seen.parts is not None:
             return (
                 f"{who} takes vectors observed in full, and of {name!r} some components are missing and "
-                "others are not; use Exact(), a Kalman filter, LikelihoodWeighting(draws) or "
-                "ParticleFilter(particles), split the vector into nodes of its parts, or leave all of it out"
+                "others are not; use Exact(), Gibbs(), HamiltonianMonteCarlo(), a Kalman filter, "
+                "LikelihoodWeighting(draws) or ParticleFilter(particles), split the vector into nodes of its "
+                "parts, or leave all of it out"
             )
     return None
 

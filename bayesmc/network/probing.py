@@ -103,11 +103,27 @@ def nearer(
         spread = min(spread, _FROM_ZERO)
     if spread == 1.0:
         return draws
-    middle = _middle(dist, shape, half_line)
+    middle = middle_of(dist, shape)
     axes = tuple(range(len(shape) - event_ndim, len(shape)))
     fine = np.isfinite(middle).all(axis=axes, keepdims=True)
     moved = middle + max(spread, 1e-9) * (np.where(np.isfinite(draws), draws, middle) - middle)
     return np.where(fine, moved, draws)
+
+
+def middle_of(dist: Distribution, shape: Shape) -> np.ndarray:
+    """The prior mean, else the median, else one above a half line's end; NaN where nothing is known."""
+    half_line = dist.support.kind == "interval" and is_half_line(dist.support)
+    found = np.full(shape, dist.support.low + 1.0 if half_line else np.nan)
+    for question in (lambda: dist.ppf(0.5), lambda: dist.mean):
+        try:
+            answer = np.broadcast_to(question(), shape)
+        except (UnsupportedError, ValueError):
+            continue
+        sane = np.isfinite(answer)
+        if half_line:
+            sane &= (answer < 1e10) & (answer > 1e-10)
+        found = np.where(sane, answer, found)
+    return found
 
 
 def reachable(
@@ -276,21 +292,6 @@ def _replaced(
         elif node.kind == "deterministic":
             value, _ = model.evaluate(name, model.probe)
             model.probe[name] = read_only(np.broadcast_to(value, old.shape))
-
-
-def _middle(dist: Distribution, shape: Shape, half_line: bool) -> np.ndarray:
-    """The prior mean, else the median, else one above a half line's end; NaN where nothing is known."""
-    found = np.full(shape, dist.support.low + 1.0 if half_line else np.nan)
-    for question in (lambda: dist.ppf(0.5), lambda: dist.mean):
-        try:
-            answer = np.broadcast_to(question(), shape)
-        except (UnsupportedError, ValueError):
-            continue
-        sane = np.isfinite(answer)
-        if half_line:
-            sane &= (answer < 1e10) & (answer > 1e-10)
-        found = np.where(sane, answer, found)
-    return found
 
 
 def _point_in(support: Support, lead: Shape, event: Shape, rng: np.random.Generator) -> np.ndarray:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import ModelError
-from bayesmc.network.evidence import Observed, read_question, warn_of_doubts, warn_of_nothing
+from bayesmc.network.doubts import warn_of_doubts, warn_of_nothing
+from bayesmc.network.evidence import Observed, read_question
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.model import Model
 from bayesmc.network.net import BayesNet

@@ -86,7 +86,7 @@ class Framed:
         for name in chosen:
             asked._node(name)
         if what == "summary":
-            return asked.summary(chosen).to_dataframe()
+            return asked.summary(None if listed is None else chosen).to_dataframe()
         if what == "probabilities":
             return _probabilities(asked, chosen, listed is not None)
         if resample is not None:

@@ -28,6 +28,14 @@ STACKED: Mapping[str, int] = {
 JOINT = ("probabilities", "entropy")
 
 
+def without_functions(model: Model) -> Model:
+    """A model for results that are stored, what labels its slices with it."""
+    found = model.without_functions()
+    if TIMES in model.cache:
+        found.cache[TIMES] = model.cache[TIMES]
+    return found
+
+
 def slices_of(model: Model, name: Any) -> tuple[str, ...] | None:
     """The nodes that are a template's node in every slice; None where the name is a node's own, or none's.
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import marking_invalid
+from bayesmc.distributions import Distribution, marking_invalid
 from bayesmc.errors import QueryError, UnsupportedError
 from bayesmc.network import Model, Observed
 from bayesmc.network.model import deterministic_above
@@ -84,8 +84,22 @@ def _of_node(
         dist, _ = model.evaluate(name, values)
         value: Any = values[name] if seen.mask is not None else seen.value
         found = model.log_density(name, dist, value)
-    full = np.broadcast_to(found, shape + node.plate_shape)
-    return np.array(full) if seen.mask is None else np.where(seen.mask, full, np.nan)
+        full = np.array(np.broadcast_to(found, shape + node.plate_shape))
+        if seen.mask is not None:
+            full = np.where(seen.mask, full, np.nan)
+        if seen.parts is not None:
+            full = _with_parts(dist, seen, full)
+    return full
+
+
+def _with_parts(dist: Distribution, seen: Observed, log: np.ndarray) -> np.ndarray:
+    """With the log densities of what was seen of vectors seen in part."""
+    assert seen.parts is not None
+    for pattern in np.unique(seen.parts.reshape(-1, seen.parts.shape[-1]), axis=0):
+        if pattern.any():
+            here = (seen.parts == pattern).all(axis=-1)
+            log = np.where(here, dist.log_prob_of(seen.value, pattern), log)
+    return log
 
 
 def refuse_unobserved(model: Model, observed: Mapping[str, Observed], names: Sequence[str]) -> None:

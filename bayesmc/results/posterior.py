@@ -6,6 +6,7 @@ comes about (from draws, from sums, from exact tables) is each subclass's own af
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
@@ -22,11 +23,11 @@ from bayesmc.results.dataframes import Framed
 from bayesmc.results.laws import Laws, TableLaws
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.marginal_answers import MarginalAnswers
-from bayesmc.results.over_time import expanded, take_templates
+from bayesmc.results.over_time import expanded, take_templates, without_functions
 from bayesmc.results.query import Query
 from bayesmc.results.saving import save
 from bayesmc.results.shown import posterior_html
-from bayesmc.results.table import Summary
+from bayesmc.results.table import Summary, row_names, shown_rows
 
 Plates = str | Sequence[str]
 _QUANTILES = (0.05, 0.5, 0.95)
@@ -260,7 +261,7 @@ class Posterior(Assessed, MarginalAnswers, Framed):
     def summary(self, names: Sequence[str] | None = None) -> Summary:
         """Mean, sd, quantiles, Monte Carlo error, ESS and R-hat per scalar; probabilities per label.
 
-        By default the nodes that are not wholly observed.
+        By default of all that was not observed; of nodes that are named the elements that were, too.
         """
         free = [n for n in self.names if self._is_free(n)]
         chosen = expanded(self.model, names) if names is not None else free
@@ -268,9 +269,10 @@ class Posterior(Assessed, MarginalAnswers, Framed):
         parts: dict[str, list[np.ndarray]] = {}
         for name in chosen:
             node = self._node(name)
+            kept = shown_rows(node, self._seen.get(name) if names is None else None)
             for key, values in self._figures(name).items():
-                parts.setdefault(key, []).append(np.asarray(values, dtype=float).ravel())
-            labels.extend(self._row_names(node))
+                parts.setdefault(key, []).append(np.asarray(values, dtype=float).ravel()[kept])
+            labels.extend(itertools.compress(row_names(node, self.model.labels), kept))
         columns = {key: np.concatenate(values) for key, values in parts.items()}
         return Summary(tuple(labels), columns, self._title())
 
@@ -300,22 +302,6 @@ class Posterior(Assessed, MarginalAnswers, Framed):
 
     def _title(self) -> str:
         return type(self.engine).__name__
-
-    def _row_names(self, node: CompiledNode) -> list[str]:
-        axes = [
-            [str(x) for x in self.model.labels.get(p, range(n))]
-            for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        axes += [[str(i) for i in range(n)] for n in node.event_shape]
-        if _is_labelled(node):
-            assert node.domain is not None
-            axes.append([str(s) for s in node.domain.states])
-        shape = tuple(len(a) for a in axes)
-        return [
-            node.name
-            + (f"[{', '.join(a[i] for a, i in zip(axes, at, strict=True))}]" if at else "")
-            for at in np.ndindex(shape)
-        ]
 
     def _node(self, name: str) -> CompiledNode:
         if callable(name):
@@ -414,7 +400,7 @@ class Posterior(Assessed, MarginalAnswers, Framed):
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
         inputs = self.problem.inputs if self.problem is not None else self._known
-        bare = self.model.without_functions()
+        bare = without_functions(self.model)
         return {**self.__dict__, "problem": None, "model": bare, "_known": inputs}
 
     def __copy__(self) -> Posterior:

@@ -145,5 +145,6 @@ def _numbers(model: Model, observed: Mapping[str, Observed], name: str) -> np.nd
         if seen is None or node.is_discrete or node.domain is not None:
             continue
         values = np.asarray(seen.value, dtype=float)
-        found.append(values[seen.mask].ravel() if seen.mask is not None else values.ravel())
+        known = np.broadcast_to(seen.numbers(len(node.event_shape)), values.shape)
+        found.append(values[known])
     return np.concatenate(found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesmc.drawing.html import figure, table
 from bayesmc.errors import UnknownNodeError, missing_extra
+from bayesmc.network import CompiledNode, Observed
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,3 +104,34 @@ class Summary:
         return "\n".join([self.title, *lines] if self.title else lines)
 
     __repr__ = __str__
+
+
+def row_names(node: CompiledNode, labels: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Names of a node's numbers, of a node with labels of its probabilities: ``"rain[yes]"``.
+
+    Parameters
+    ----------
+    labels : mapping
+        Of plates that have some.
+    """
+    axes = [
+        [str(x) for x in labels.get(p, range(n))]
+        for p, n in zip(node.plates, node.plate_shape, strict=True)
+    ]
+    axes += [[str(i) for i in range(n)] for n in node.event_shape]
+    if node.domain is not None and node.domain.labels is not None:
+        axes.append([str(s) for s in node.domain.states])
+    shape = tuple(len(a) for a in axes)
+    return [
+        node.name + (f"[{', '.join(a[i] for a, i in zip(axes, at, strict=True))}]" if at else "")
+        for at in np.ndindex(shape)
+    ]
+
+
+def shown_rows(node: CompiledNode, seen: Observed | None) -> np.ndarray:
+    """Which of a node's rows are left where what was seen of it has none."""
+    known = np.zeros(node.value_shape, dtype=bool)
+    if seen is not None:
+        known = known | seen.numbers(len(node.event_shape))
+    labelled = node.domain is not None and node.domain.labels is not None
+    return np.repeat(~known.ravel(), node.domain.size if labelled and node.domain else 1)

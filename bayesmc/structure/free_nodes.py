@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.support import Support
+from bayesmc.distributions.support import Support, real
 from bayesmc.distributions.transforms import Bounded, Identity, Transform, Wrapped, transform_of
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import (
@@ -47,13 +47,15 @@ class FreeNode:
     start : int
         Place of its first free number among all.
     elements : ndarray of int or None
-        Flat plate elements that are hidden; None where all are.
+        Flat plate elements that are hidden; None where all are. Of vectors seen in part flat components.
     seen : ndarray or None
         The values of the others, shape ``(*plates, *event)``.
     transform : Transform or None
         None where the bounds depend on parents.
     bounds : tuple of Expression
         In this case: lower and upper, of stored values of parents, shape the plates.
+    by_component : bool
+        Whether components of real vectors are hidden one by one.
     """
 
     node: CompiledNode
@@ -62,21 +64,32 @@ class FreeNode:
     seen: np.ndarray | None
     transform: Transform | None
     bounds: tuple[Expression, ...] = ()
+    by_component: bool = False
 
     @property
     def name(self) -> str:
         return self.node.name
 
     @property
+    def plates(self) -> Shape:
+        """Shape of what moves or stays as one: the node's plates; of single components their places, too."""
+        return self.node.value_shape if self.by_component else self.node.plate_shape
+
+    @property
+    def event(self) -> Shape:
+        """Shape of what one such element is."""
+        return () if self.by_component else self.node.event_shape
+
+    @property
     def lead(self) -> Shape:
         """Shape of the elements that move: the plates, or their number."""
-        return self.node.plate_shape if self.elements is None else (len(self.elements),)
+        return self.plates if self.elements is None else (len(self.elements),)
 
     @property
     def own_shape(self) -> Shape:
         """Shape of the free numbers of one element."""
         if self.transform is None:
-            return self.node.event_shape
+            return self.event
         return self.transform.unconstrained_shape
 
     @property
@@ -86,7 +99,7 @@ class FreeNode:
     @property
     def labels(self) -> list[str]:
         """A name for every free number: ``sd[2]``."""
-        at = np.ndindex(*self.node.plate_shape)
+        at = np.ndindex(*self.plates)
         places = list(at) if self.elements is None else [p for p, _ in self._hidden(at)]
         inner = list(np.ndindex(*self.own_shape))
         return [
@@ -122,11 +135,11 @@ class FreeNode:
         transform = self.transform
         if transform is None:
             low, high = (self._moving(substituted(b, dict(above))) for b in self.bounds)
-            transform = Bounded(self.node.event_shape, low, high)
+            transform = Bounded(self.event, low, high)
         value = expression_of(transform.formula(u))
         volume = expression_of(transform.log_det_formula(u))
         volume = reduction(np.add, volume, range(len(volume.shape)))
-        return self._with_seen(broadcast(value, (*self.lead, *self.node.event_shape))), volume
+        return self._with_seen(broadcast(value, (*self.lead, *self.event))), volume
 
     def constrained(self, u: np.ndarray, above: Mapping[str, np.ndarray]) -> np.ndarray:
         """Stored values at free numbers of shape ``(*batch, size)``, given those of nodes above."""
@@ -137,16 +150,16 @@ class FreeNode:
         assert self.seen is not None
         whole = np.empty((*u.shape[:-1], *self.seen.shape))
         whole[...] = self.seen
-        count = math.prod(self.node.plate_shape)
-        whole.reshape(*u.shape[:-1], count, *self.node.event_shape)[self._at] = value
+        count = math.prod(self.plates)
+        whole.reshape(*u.shape[:-1], count, *self.event)[self._at] = value
         return whole
 
     def freed(self, value: np.ndarray, above: Mapping[str, np.ndarray]) -> np.ndarray:
         """The free numbers behind stored values, shape ``(*batch, size)``."""
         batch = value.shape[: value.ndim - len(self.node.value_shape)]
         if self.elements is not None:
-            count = math.prod(self.node.plate_shape)
-            value = value.reshape(*batch, count, *self.node.event_shape)[self._at]
+            count = math.prod(self.plates)
+            value = value.reshape(*batch, count, *self.event)[self._at]
         free = self.map_at(above).unconstrain(value)
         return free.reshape(*free.shape[: free.ndim - len(self.lead + self.own_shape)], self.size)
 
@@ -163,13 +176,13 @@ class FreeNode:
         low, high = self._program(above)
         if self.elements is not None:
             low, high = (self._picked(b) for b in (low, high))
-        return Bounded(self.node.event_shape, low, high)
+        return Bounded(self.event, low, high)
 
     # ---- private -------------------------------------------------------------------------------
 
     @property
     def _at(self) -> tuple[Any, ...]:
-        events = (slice(None),) * len(self.node.event_shape)
+        events = (slice(None),) * len(self.event)
         return (..., self.elements, *events)
 
     @cached_property
@@ -182,7 +195,7 @@ class FreeNode:
         return [(p, k) for k, p in enumerate(places) if k in wanted]
 
     def _picked(self, bound: np.ndarray) -> np.ndarray:
-        shape = self.node.plate_shape
+        shape = self.plates
         flat = bound.reshape(*bound.shape[: bound.ndim - len(shape)], math.prod(shape))
         return flat[..., self.elements]
 
@@ -196,7 +209,7 @@ class FreeNode:
         if self.elements is None:
             return value
         shape = self.node.value_shape
-        width = math.prod(self.node.event_shape)
+        width = math.prod(self.event)
         at = np.arange(math.prod(shape)).reshape(-1, width)
         at[self.elements] = math.prod(shape) + np.arange(len(self.elements) * width).reshape(
             -1, width
@@ -218,6 +231,14 @@ def free_node(target: Target, name: str, start: int) -> FreeNode:
     elements, seen = target.free_elements(name), target.seen(name)
     value = None if seen is None else np.broadcast_to(seen.value, node.value_shape)
     support = _support(target, node)
+    if seen is not None and seen.parts is not None:
+        if support.kind != "real vector":
+            raise UnsupportedError(
+                f"of node {name!r} vectors are seen in part that are not real vectors ({support.describe()})"
+            )
+        known = np.broadcast_to(seen.numbers(len(node.event_shape)), node.value_shape)
+        hidden = np.flatnonzero(~known)
+        return FreeNode(node, start, hidden, value, transform_of(real, ()), by_component=True)
     if all(isinstance(b, (np.ndarray, float)) for b in (support.low, support.high)):
         if support.is_single:
             return FreeNode(node, start, elements, value, transform_of(support, node.event_shape))

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.errors import EvidenceError, ShapeError, TraceError, UnsupportedError
 from bayesmc.lowering import Bound
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
@@ -150,10 +151,11 @@ class LogDensity:
         return array
 
 
+@by_keyword
 def log_density(
     net: BayesNet | FactorGraph,
     evidence: Mapping[str, Any] | None = None,
-    *,
+    *beyond: Never,
     inputs: Mapping[str, Any] | None = None,
     compiled: bool = False,
 ) -> LogDensity:
@@ -206,6 +208,8 @@ def log_density(
     >>> f.labels, round(float(f.constrain(found.x)["rate"]), 3)
     (['rate'], 2.5)
     """
+    if beyond:
+        refuse_positions(log_density, beyond)
     return LogDensity(net, evidence, inputs, compiled)
 
 

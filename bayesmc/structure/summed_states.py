@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
 
 from bayesmc.categorical import log_sum_exp, pick_log
 from bayesmc.expression import Program
+from bayesmc.passes.arrays import for_arrays
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.summing import Summed
 from bayesmc.structure.target import Values
@@ -22,28 +24,31 @@ def drawn_states(
     rng: np.random.Generator | None,
     given: Mapping[str, np.ndarray] | None = None,
 ) -> tuple[Values, np.ndarray]:
+    """See ``StateDraws``; for those who ask once."""
+    return StateDraws(density)(u, rng, given)
+
+
+class StateDraws:
     """Stored values of the nodes that are summed out, and the log probability of these states given ``u``.
+
+    Called with ``u`` of shape ``(draws, size)``, and
+
+    - ``rng``, by which states are drawn;
+    - ``given``, node -> states, shape ``(draws, *plates)``, whose probability is asked for instead;
+    - ``values``, stored values of hidden nodes that do not move, shape ``(draws, *plates, *event)``,
+
+    it returns node -> states, shape ``(draws, *plates)``, and log probabilities, shape ``(draws,)``.
 
     Parameters
     ----------
     density : UnconstrainedDensity
-    u : ndarray, shape (draws, size)
-    rng : Generator or None
-    given : dict, optional
-        Node -> states, shape ``(draws, *plates)``, whose probability is asked for; else they are drawn.
-
-    Returns
-    -------
-    dict
-        Node -> shape ``(draws, *plates)``.
-    ndarray, shape (draws,)
 
     Examples
     --------
     >>> import numpy as np
     >>> import bayesmc as bmc
     >>> from bayesmc.network import pose
-    >>> from bayesmc.structure.summed_states import drawn_states
+    >>> from bayesmc.structure.summed_states import StateDraws
     >>> from bayesmc.structure.target import target_of
     >>> from bayesmc.structure.unconstrained import unconstrained_density
     >>> net = bmc.BayesNet()
@@ -51,53 +56,54 @@ def drawn_states(
     >>> net.add("x", lambda z: bmc.Normal(4.0 * z, 1.0))
     >>> net.add("y", lambda x: bmc.Normal(x, 1.0))
     >>> density = unconstrained_density(target_of(pose(net, {"y": 1.0})), None, ["z"])
-    >>> values, log = drawn_states(density, np.array([[4.0], [-3.0]]), np.random.default_rng(0))
+    >>> values, log = StateDraws(density)(np.array([[4.0], [-3.0]]), np.random.default_rng(0))
     >>> values["z"], log.round(4)
     (array([1, 0], dtype=uint8), array([-0.0003, -0.    ]))
     """
-    values: Values = {}
-    log = np.zeros(len(u))
-    for summed in density.tables:
-        found, own = _of_component(density, summed, u, rng, given)
-        values.update(found)
-        log += own
-    return values, log
+
+    def __init__(self, density: UnconstrainedDensity) -> None:
+        self.density = density
+        roots = [[t.rest] if t.table is None else [t.rest, t.table] for t in density.tables]
+        self._programs = [Program(for_arrays(own)) for own in roots]
+        self._entries = [max(sum(math.prod(r.shape) for r in own), 1) for own in roots]
+
+    def __call__(
+        self,
+        u: np.ndarray,
+        rng: np.random.Generator | None,
+        given: Mapping[str, np.ndarray] | None = None,
+        values: Mapping[str, np.ndarray] | None = None,
+    ) -> tuple[Values, np.ndarray]:
+        found: Values = {}
+        log = np.zeros(len(u))
+        read = {n: values[n] for n in self.density.others} if values is not None else {}
+        for k, summed in enumerate(self.density.tables):
+            names = (*summed.listed[0], *summed.labels)
+            count, parts = max(_ENTRIES // self._entries[k], 1), []
+            for first in range(0, len(u), count):
+                at = slice(first, first + count)
+                own = None if given is None else {n: given[n][at] for n in names}
+                leaves = {FREE: u[at], **{n: v[at] for n, v in read.items()}}
+                parts.append(_some(self.density, summed, self._programs[k], leaves, rng, own))
+            found.update({n: np.concatenate([part[n] for part, _ in parts]) for n in names})
+            log += np.concatenate([own for _, own in parts])
+        return found, log
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _of_component(
-    density: UnconstrainedDensity,
-    summed: Summed,
-    u: np.ndarray,
-    rng: np.random.Generator | None,
-    given: Mapping[str, np.ndarray] | None,
-) -> tuple[Values, np.ndarray]:
-    roots = [summed.rest] if summed.table is None else [summed.rest, summed.table]
-    entries = sum(int(np.prod(root.shape)) for root in roots)
-    program, count = Program(roots), max(_ENTRIES // max(entries, 1), 1)
-    names = (*summed.listed[0], *summed.labels)
-    parts = []
-    for first in range(0, len(u), count):
-        at = slice(first, first + count)
-        own = None if given is None else {n: given[n][at] for n in names}
-        parts.append(_some(density, summed, program, u[at], rng, own))
-    values = {n: np.concatenate([part[n] for part, _ in parts]) for n in parts[0][0]}
-    return values, np.concatenate([log for _, log in parts])
 
 
 def _some(
     density: UnconstrainedDensity,
     summed: Summed,
     program: Program,
-    u: np.ndarray,
+    leaves: Mapping[str, np.ndarray],
     rng: np.random.Generator | None,
     given: Mapping[str, np.ndarray] | None,
 ) -> tuple[Values, np.ndarray]:
-    model, draws = density.target.model, len(u)
+    model, draws = density.target.model, len(leaves[FREE])
     with np.errstate(all="ignore"):
-        rest, *tables = program({FREE: u})
+        rest, *tables = program(leaves)
     rest = np.broadcast_to(rest, (draws, *summed.rest.shape))
     rows = rest
     if summed.table is not None:

@@ -122,6 +122,11 @@ def sum_out(
     return found
 
 
+def components(target: Target, names: Sequence[str]) -> list[list[str]]:
+    """Finite nodes of the chain that meet in terms, and so are summed out together."""
+    return _components(names, [_reads(t) & set(names) for t in target.terms_of(names)])
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 

@@ -204,6 +204,13 @@ class Target:
         seen = self.seen(name)
         return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
 
+    def with_seen(self, name: str, value: np.ndarray) -> np.ndarray:
+        """Values of a chain node with what was seen of it put in place."""
+        seen = self.seen(name)
+        if seen is None:
+            return value
+        return np.where(seen.numbers(len(self.model[name].event_shape)), seen.value, value)
+
     @cached_property
     def _inside(self) -> frozenset[str]:
         """The chain."""
@@ -343,7 +350,7 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
     ----------
     also : iterable of str
         Nodes that belong to the chain even where nothing observed depends on them; so do those whose
-        density has no sampler.
+        density has no sampler, and those of which vectors are seen in part.
     """
     kept: dict[frozenset[str], Target] = problem.cache.setdefault("targets", {})
     key = frozenset(also)
@@ -379,8 +386,9 @@ def _target(problem: Problem, also: frozenset[str]) -> Target:
         else:
             varying.add(name)
     also &= varying
-    unsampled = {n for n in varying if model[n].is_stochastic and model[n].unsampled}
-    wanted = _ancestors(model, observed, varying, unsampled | also)
+    moved = {n for n in varying if model[n].is_stochastic and model[n].unsampled}
+    moved |= {n for n, seen in observed.items() if n in varying and seen.parts is not None}
+    wanted = _ancestors(model, observed, varying, moved | also)
     chain = tuple(
         n for n, node in model.nodes.items() if n in wanted and n in varying and node.is_stochastic
     )

@@ -20,7 +20,7 @@ from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.expression import Expression, Program
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.summing import Summed
-from bayesmc.structure.target import Target, Term, Values
+from bayesmc.structure.target import Term, Values
 
 #: points, and how far the free numbers of each are from zero
 _SPREADS = (0.0, 3.0, 0.1, 5.0, 1.0, 2.0, 0.3, 1.0)
@@ -118,7 +118,7 @@ def other_values(density: UnconstrainedDensity, k: int) -> Values:
         if name not in density.names:
             if states is None:
                 raise UnsupportedError(f"no reachable value of node {name!r} is known to try it on")
-            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
+            values[name] = target.with_seen(name, states[name][k % len(states[name])])
     return values
 
 
@@ -201,15 +201,6 @@ def _completed(density: UnconstrainedDensity, u: np.ndarray, values: Values) -> 
     except BayesmcError:
         return False
     return True
-
-
-def _with_seen(target: Target, name: str, value: np.ndarray) -> np.ndarray:
-    seen = target.seen(name)
-    if seen is None:
-        return value
-    assert seen.mask is not None  # of a node in the chain
-    mask = np.reshape(seen.mask, np.shape(seen.mask) + (1,) * len(target.model[name].event_shape))
-    return np.where(mask, seen.value, value)
 
 
 def _counted(term: Term, values: Values) -> np.ndarray | None:

@@ -151,6 +151,19 @@ def test_arguments_that_go_by_keyword_are_named() -> None:
         bmc.infer(line(), {"y": Y}, bmc.Gibbs())  # type: ignore[misc]
     with pytest.raises(TypeError, match=r"filter\(dbn, observations, rng=\.\.\.\)"):
         bmc.filter(walk(lambda x_prev: bmc.Normal(x_prev, 1.0)), {"y": Y}, 1)  # type: ignore
+    for call, names in (
+        (bmc.fit, "net, data"), (bmc.map, "net, evidence"), (bmc.log_density, "net, evidence"),
+        (bmc.explain, "net, evidence, engine"),
+    ):  # fmt: skip
+        some: Any = (line(), {"y": Y}, None)[: names.count(",") + 1]
+        with pytest.raises(TypeError, match=rf"{call.__name__}\({names}, inputs=\.\.\.\)"):
+            call(*some, {"x": X})
+    with pytest.raises(
+        TypeError, match=r"what follows data by keyword; write fit\(net, data, learn="
+    ):
+        bmc.fit(line(), {"y": Y}, ["a"])  # type: ignore[misc]
+    with pytest.raises(TypeError, match=r"prior_predict\(net, draws, inputs=\.\.\.\)"):
+        bmc.prior_predict(line(), 10, {"x": X})  # type: ignore[misc]
     assert list(inspect.signature(bmc.infer).parameters)[:3] == ["net", "evidence", "inputs"]
     assert pickle.loads(pickle.dumps(bmc.infer)) is bmc.infer
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import bayesmc as bmc
-from bayesmc.errors import EvidenceError, UnsupportedError
+from bayesmc.errors import EvidenceError, ModelError, UnsupportedError
 
 COV = np.array([[2.0, 0.8, 0.3], [0.8, 1.0, 0.2], [0.3, 0.2, 1.5]])
 NAN = np.nan
@@ -164,7 +164,6 @@ def test_particles():
 @pytest.mark.parametrize(
     "engine",
     [
-        bmc.Gibbs(50),
         bmc.MetropolisHastings(50),
         bmc.Rejection(50),
         bmc.Importance(50, proposal={"m": lambda: bmc.Normal(0.0, 1.0)}),
@@ -215,6 +214,131 @@ def test_the_derived_proposal_looks_at_the_components_that_are_there():
     for row in rows:
         belief = engine.step(belief, {"y": row})
     assert belief.log_marginal_likelihood == pytest.approx(found.log_marginal_likelihood, rel=1e-12)
+
+
+CHAINS = [
+    bmc.Gibbs(1000, warmup=200, chains=8, debug=True),
+    bmc.HamiltonianMonteCarlo(1000, warmup=300),
+]
+
+
+def held(found, name, mean, std):
+    """Means within five of their errors, an alarm in two million each; deviations within a tenth."""
+    assert (np.abs(found.mean(name) - mean) <= 5 * found.mcse(name) + 1e-12).all()
+    assert (np.abs(found.std(name) - std) <= 0.1 * std + 1e-12).all()
+
+
+@pytest.mark.parametrize("engine", CHAINS, ids=["Gibbs", "Hamiltonian"])
+@pytest.mark.parametrize("seed", range(3))
+def test_chains_draw_what_is_missing(engine, seed):
+    """Random rows, what depends on them, and their mean, against exact answers."""
+    rng = np.random.default_rng(seed)
+    root, slope, by = rng.normal(size=(3, 3)), rng.normal(size=(3, 3)), rng.normal(size=3)
+    net = bmc.BayesNet(plates={"row": 6})
+    net.add("mean", bmc.MvNormal(np.zeros(3), 2 * np.eye(3)))
+    cov = root @ root.T + 0.3 * np.eye(3)
+    net.add("x", lambda mean: bmc.MvNormal(np.matvec(slope, mean), cov), plates="row")
+    net.add("y", lambda x: bmc.Normal(np.vecdot(x, by), 0.7), plates="row")
+    x, y = rng.normal(size=(6, 3)), rng.normal(size=6)
+    x[rng.random((6, 3)) < 0.4] = NAN
+    x[0], x[1, 1], y[2:4] = NAN, NAN, NAN
+    wanted = bmc.infer(net, {"x": x, "y": y}, engine=bmc.Exact())
+    found = bmc.infer(net, {"x": x, "y": y}, engine=engine, rng=seed)
+    held(found, "mean", wanted.mean("mean"), wanted.std("mean"))
+    held(found, "x", wanted.mean("x"), wanted.std("x"))
+    there = np.isfinite(x)
+    assert (found["x"][..., there] == x[there]).all()
+
+
+def counted(count):
+    """Counts that depend on two numbers of each row, in no affine way."""
+    net = bmc.BayesNet(plates={"row": 3})
+    net.add("x", bmc.MvNormal([0.5, 0.0], [[1.0, 0.6], [0.6, 1.0]]), plates="row")
+    net.add("n", lambda x: count(np.exp(x[..., 0] + 0.5 * x[..., 1])), plates="row")
+    return net, {"x": [[NAN, 1.0], [0.2, NAN], [NAN, NAN]], "n": [4, 0, 2]}
+
+
+@pytest.mark.parametrize("engine", [*CHAINS, None], ids=["Gibbs", "Hamiltonian", "default"])
+def test_what_is_missing_may_have_children(engine):
+    net, evidence = counted(bmc.Poisson)
+    found = bmc.infer(net, evidence, engine=engine, rng=3)
+    at = np.linspace(-5.0, 6.0, 276)
+    a, b = np.meshgrid(at, at, indexing="ij")
+    log = stats.multivariate_normal([0.5, 0.0], [[1.0, 0.6], [0.6, 1.0]]).logpdf(np.dstack([a, b]))
+    for k, (first, second) in enumerate(evidence["x"]):
+        logs = log + stats.poisson(np.exp(a + 0.5 * b)).logpmf(evidence["n"][k])
+        weight = np.exp(logs - logs.max())
+        near = [np.abs(at - v).argmin() if np.isfinite(v) else slice(None) for v in (first, second)]
+        kept = np.zeros_like(weight)
+        kept[tuple(near)] = weight[tuple(near)]
+        kept /= kept.sum()
+        mean = np.array([(kept * a).sum(), (kept * b).sum()])
+        std = np.sqrt([(kept * (x - m) ** 2).sum() for x, m in zip((a, b), mean, strict=True)])
+        off = np.abs(found.mean("x")[k] - mean)
+        assert (off <= 5 * found.mcse("x")[k] + 1e-3).all()
+        assert (np.abs(found.std("x")[k] - std) <= 0.12 * std + 1e-6).all()
+
+
+def camel():
+    """A covariance that is not known, of pairs most of which lack a number: Tanner and Wong (1987)."""
+    net = bmc.BayesNet(plates={"pair": 12})
+    net.add("precision", bmc.Wishart(2.0, 1000 * np.eye(2)))
+    net.add(
+        "x", lambda precision: bmc.MvNormal(np.zeros(2), np.linalg.inv(precision)), plates="pair"
+    )
+    rows = [[1, 1], [1, -1], [-1, 1], [-1, -1], *[[2, NAN], [-2, NAN], [NAN, 2], [NAN, -2]] * 2]
+    return net, {"x": np.array(rows)}
+
+
+def test_a_covariance_of_rows_seen_in_part():
+    """Published: means .862 and 0, deviations .512 of the diagonal and .659 of the correlation."""
+    net, evidence = camel()
+    found = bmc.infer(net, evidence, rng=0)
+    assert isinstance(found.engine, bmc.Gibbs)
+    precision = found["precision"]
+    rho = -precision[..., 0, 1] / np.sqrt(precision[..., 0, 0] * precision[..., 1, 1])
+    assert np.abs(found.mean("precision").diagonal() - 0.862).max() < 0.03
+    assert np.abs(found.std("precision").diagonal() - 0.512).max() < 0.03
+    assert abs(rho.mean()) < 0.1 and abs(rho.std() - 0.659) < 0.03
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+def test_log_likelihoods_are_of_what_was_seen():
+    net, evidence = camel()
+    found = bmc.infer(net, evidence, engine=bmc.Gibbs(400, warmup=100, chains=8), rng=0)
+    log = found.log_likelihood("x")["x"]
+    cov = np.linalg.inv(found["precision"])
+    for k, row in ((0, [0, 1]), (4, [0]), (6, [1])):
+        part = cov[3, 7][np.ix_(row, row)]
+        wanted = stats.multivariate_normal(cov=part).logpdf(evidence["x"][k][row])
+        assert log[3, 7, k] == pytest.approx(wanted)
+    assert len(found.loo().pointwise) == 12
+
+
+def test_a_kernel_that_moves_what_was_seen_is_refused(monkeypatch):
+    from bayesmc.kernels.completed import Completed
+
+    net, evidence = camel()
+    step = Completed.step
+
+    def wrong(self, values, memory, rng, warmup):
+        new, memory = step(self, values, memory, rng, warmup)
+        return {n: v + 1e-9 for n, v in new.items()}, memory
+
+    monkeypatch.setattr(Completed, "step", wrong)
+    with pytest.raises(ModelError, match="other values than were observed of it"):
+        bmc.infer(net, evidence, engine=bmc.Gibbs(5, warmup=5), rng=0)
+
+
+def test_parts_without_marginals_are_refused_before_a_run():
+    net = bmc.BayesNet()
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("j", lambda m: bmc.Joint(bmc.Normal(m, 1.0), bmc.Dirichlet(np.ones(3))))
+    evidence = {"j": [0.3, 0.2, NAN, NAN]}
+    assert "Dirichlet has no marginal" in bmc.Gibbs().unsupported(net, evidence)
+    found = bmc.infer(net, {"j": [0.3, NAN, NAN, NAN]}, engine=bmc.Gibbs(2000, warmup=100), rng=0)
+    held(found, "m", 0.15, np.sqrt(0.5))
+    assert np.abs(found.mean("j")[1:] - 1 / 3).max() < 0.03
 
 
 def test_families_without_marginals_are_refused():

@@ -9,6 +9,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.errors import ParameterError
+from bayesmc.network import pose
 
 # few draws, of which the errors tell
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
@@ -123,3 +124,18 @@ def test_states_that_are_out_of_range_stay_the_models_fault() -> None:
 def test_engines_that_draw_forward_say_what_to_do() -> None:
     with pytest.raises(ParameterError, match=r"'y'.*prior that cannot be.*Truncated.*Gibbs"):
         bmc.infer(one_scale(), {"y": 0.5}, engine=bmc.LikelihoodWeighting(1000), rng=0)
+
+
+def test_planning_tolerates_what_running_tolerates():
+    """Bounds that cross at the values on which kernels are tried; a step function, so that slices move it."""
+    net = bmc.BayesNet(plates={"date": 3})
+    net.add("low", bmc.Uniform(0.0, 10.0))
+    net.add("high", bmc.Uniform(0.0, 10.0))
+    net.add("t", lambda low, high: bmc.Uniform(low, high), plates="date")
+    net.add("x", lambda t: bmc.Normal(np.interp(t, [0.0, 10.0], [0.0, 20.0]), 1.0), plates="date")
+    problem = pose(net, {"x": [8.0, 9.0, 11.0]})
+    probe = problem.model.probe
+    probe["low"], probe["high"] = probe["high"], probe["low"]
+    engine = bmc.Gibbs(2000, warmup=200, chains=8)
+    assert engine.refusal(problem) is None and "slice" in engine.describe(problem)["t"]
+    assert bmc.MetropolisHastings(200).refusal(problem) is None

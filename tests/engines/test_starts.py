@@ -12,6 +12,7 @@ from scipy.special import expit
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.gibbs import plan_of
+from bayesmc.engines.mcmc.given import read_start
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import (
     EvidenceError,
@@ -141,7 +142,42 @@ def ordinal() -> tuple[bmc.BayesNet, dict[str, Any]]:
     return net, {"y": np.digitize(seen, [-1.0, 0.0, 1.0])}
 
 
-MODELS = {f.__name__: f for f in (lifetimes, regression, far_off, ordinal)}
+def captures() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Whoever was caught is there: forward draws of all that are there are never right."""
+    rng = np.random.default_rng(0)
+    there, effect = rng.random(150) < 0.7, rng.normal(size=150)
+    caught = (rng.random((150, 4)) < expit(effect)[:, None]) & there[:, None]
+    net = bmc.BayesNet(plates={"animal": 150, "day": 4})
+    net.add("share", bmc.Uniform(0.0, 1.0))
+    net.add("chance", bmc.Uniform(0.0, 1.0), plates="day")
+    net.add("sigma", bmc.Uniform(0.0, 5.0))
+    net.add("eps", lambda sigma: bmc.Normal(0.0, sigma), plates="animal")
+    net.add("z", lambda share: bmc.Bernoulli(share), plates="animal")
+
+    def y(z: Any, eps: Any, chance: Any) -> Any:
+        odds = np.log(chance / (1 - chance)) + eps
+        return bmc.Bernoulli(np.where(z == 1, 1 / (1 + np.exp(-odds)), 0.0))
+
+    net.add("y", y, plates=("animal", "day"))
+    return net, {"y": caught.astype(int)}
+
+
+def occupancy() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Labels that depend on labels."""
+    rng = np.random.default_rng(0)
+    site = rng.random(40) < 0.6
+    visit = (rng.random((40, 3)) < 0.7) & site[:, None]
+    net = bmc.BayesNet(plates={"site": 40, "visit": 3, "test": 3})
+    for name in ("psi", "theta", "p"):
+        net.add(name, bmc.Beta(1.0, 1.0))
+    net.add("z", lambda psi: bmc.Bernoulli(psi), plates="site")
+    net.add("w", lambda z, theta: bmc.Bernoulli(z * theta), plates=("site", "visit"))
+    net.add("y", lambda w, p: bmc.Bernoulli(w * p), plates=("site", "visit", "test"))
+    seen = (rng.random((40, 3, 3)) < 0.5) & visit[..., None]
+    return net, {"y": seen.astype(int)}
+
+
+MODELS = {f.__name__: f for f in (lifetimes, regression, far_off, ordinal, captures, occupancy)}
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -153,6 +189,32 @@ def test_a_finite_density_somewhere_is_enough(name: str) -> None:
         assert tracemalloc.get_traced_memory()[1] < 300e6  # bytes; it was 2.5e9
     finally:
         tracemalloc.stop()
+
+
+def test_labels_that_the_data_leave_one_state_are_no_cause_to_leave_the_prior() -> None:
+    """Chains began at a scale of 1e-250 with all effects 0, where the density has no end, and stayed."""
+    net, evidence = captures()
+    with marking_invalid(), np.errstate(all="ignore"):
+        target = target_of(pose(net, evidence))
+        values = start_states(target, 16, np.random.default_rng(0))
+    assert (values["sigma"] > 1e-3).all()  # of 16 draws of the prior one is below once in 300
+    assert (values["z"] >= evidence["y"].any(axis=1)).all()
+    posterior = bmc.infer(net, evidence, engine=bmc.Gibbs(5, 5, compiled=False), rng=0)
+    assert (posterior["sigma"].std(axis=-1) > 0.0).all()
+
+
+def test_a_climb_stays_out_of_the_neck_of_a_funnel() -> None:
+    """The way to the data is long, and on it the density of all effects grew without end."""
+    net = bmc.BayesNet(plates={"i": 30})
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("s", bmc.HalfNormal(1.0))
+    net.add("u", lambda s: bmc.Normal(0.0, s), plates="i")
+    net.add("y", lambda m, u: bmc.Uniform(m + u + 50.0, m + u + 51.0), plates="i")
+    with marking_invalid(), np.errstate(all="ignore"):
+        target = target_of(pose(net, {"y": np.linspace(0.0, 0.5, 30)}))
+        values = start_states(target, 4, np.random.default_rng(0))
+        assert np.isfinite(target.log_density(values)).all()
+    assert (values["s"] > 1e-3).all()
 
 
 def test_both_engines_start_and_agree() -> None:
@@ -180,6 +242,21 @@ def test_impossible_evidence_is_named_at_once() -> None:
     net.add("t", lambda p: bmc.Truncated(bmc.Normal(p, 1.0), 0.0, totals / 10.0), plates="i")
     with pytest.raises(ZeroProbabilityError, match=r"'t' \(plate element 1\): 2.5.*from 0 to 1"):
         bmc.infer(net, {"t": [0.5, 2.5, 5.0, 0.5]}, engine=bmc.Gibbs(), rng=0)
+
+
+def test_what_other_counts_allow_is_not_impossible() -> None:
+    """Under so vague a rate all counts that were tried were 0, and what was seen was called impossible."""
+    net = bmc.BayesNet(plates={"site": 20, "visit": 3})
+    net.add("rate", bmc.Gamma(0.01, 0.01))
+    net.add("p", bmc.Beta(1.0, 1.0))
+    net.add("n", lambda rate: bmc.Poisson(rate), plates="site")
+    net.add("y", lambda n, p: bmc.Binomial(n, p), plates=("site", "visit"))
+    seen = np.random.default_rng(0).binomial(5, 0.4, (20, 3))
+    for seed in range(4):
+        with marking_invalid(), np.errstate(all="ignore"):
+            target = target_of(pose(net, {"y": seen}))
+            values = start_states(target, 4, np.random.default_rng(seed))
+        assert (values["n"] >= seen.max(axis=1)).all()
 
 
 def test_where_nothing_is_found_the_nearest_state_is_shown() -> None:
@@ -229,6 +306,34 @@ def test_a_start_in_part_leaves_the_rest_to_draws() -> None:
     given = {"m": np.full(4, 2.0)}
     values = start_states(target, 4, np.random.default_rng(0), given)
     assert (values["m"] == 2.0).all() and len(np.unique(values["v"])) == 12
+
+
+STARTS: dict[str, tuple[Any, Any]] = {
+    "one number for all elements": ({"v": 0.5}, np.full((4, 3), 0.5)),
+    "one for each element": ({"v": [1.0, 2.0, 3.0]}, np.tile([1.0, 2.0, 3.0], (4, 1))),
+    "one for each chain": ({"v": np.arange(4.0)[:, None]}, np.arange(4.0)[:, None] * np.ones(3)),
+    "a label": ({"c": "yes"}, np.ones(4)),
+}
+
+
+@pytest.mark.parametrize("what", STARTS)
+def test_a_start_broadcasts(what: str) -> None:
+    start, wanted = STARTS[what]
+    found = read_start("Gibbs", pose(*mixed()), start, 4)
+    (name,) = start
+    assert found[name].tolist() == wanted.tolist()
+
+
+def test_a_start_broadcasts_over_the_numbers_of_one_value() -> None:
+    net = bmc.BayesNet(plates={"i": 2})
+    net.add("p", bmc.Dirichlet(np.ones(4)), plates="i")
+    net.add("y", lambda p: bmc.Categorical(p), plates="i")
+    problem = pose(net, {"y": [0, 1]})
+    assert (read_start("Gibbs", problem, {"p": 0.25}, 3)["p"] == np.full((3, 2, 4), 0.25)).all()
+    one = [0.1, 0.2, 0.3, 0.4]
+    assert read_start("Gibbs", problem, {"p": one}, 3)["p"].tolist() == [[one, one]] * 3
+    with pytest.raises(EvidenceError, match="cannot be"):
+        read_start("Gibbs", problem, {"p": 0.5}, 3)
 
 
 BAD: dict[str, tuple[Any, type[Exception], str]] = {

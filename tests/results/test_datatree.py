@@ -1,6 +1,8 @@
 """Groups of ArviZ's tree, as PyMC writes them, and that ArviZ takes them."""
 
+import pickle
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,3 +105,23 @@ def test_weighted_draws_are_refused_in_any_group() -> None:
     weighted.weights = np.full((1, 100), 0.01)
     with pytest.raises(UnsupportedError, match="the group 'prior' are weighted"):
         posterior.to_datatree(prior=weighted)
+
+
+@pytest.mark.parametrize("way", ["pickle", "file"])
+def test_dates_travel_with_an_answer(way: str, tmp_path: Path) -> None:
+    """Of a template's data by their index; a stored answer numbered its slices 0, 1, ... instead."""
+    pd = pytest.importorskip("pandas")
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    rows = pd.DataFrame({"y": X[:4]}, index=pd.date_range("2024-01-01", periods=4, freq="MS"))
+    answer = bmc.infer(dbn, rows, engine=bmc.Exact())
+    wanted = answer.to_datatree(resample=3, rng=0)["posterior"]["time"].values
+    assert (wanted == rows.index.values).all()
+    if way == "pickle":
+        kept = pickle.loads(pickle.dumps(answer.resample(3, rng=0)))
+    else:
+        pytest.importorskip("h5netcdf")
+        answer.resample(3, rng=0).save(tmp_path / "answer.nc")
+        kept = bmc.load(tmp_path / "answer.nc")
+    assert (kept.to_datatree()["posterior"]["time"].values == wanted).all()

@@ -37,6 +37,7 @@ from bayesmc.engines.approximate.weights import (
 )
 from bayesmc.errors import LowEssWarning
 from bayesmc.results import DrawsPosterior, Posterior
+from bayesmc.results.table import row_names
 
 #: draws of which a tail can be told at all
 _FEWEST = 25
@@ -185,7 +186,7 @@ class Check:
                 moved = np.where(two > EQUAL * one, (found - plain) / two, certain)
                 one, two = (np.maximum(sd, _COUNTED * least) for sd in (before, after))
                 wider = np.where(one > 0, two / one - 1.0, 0.0)
-            labels = self.posterior._row_names(node)
+            labels = row_names(node, self.posterior.model.labels)
             both = zip(labels, plain, found, error, before, after, wider, moved, strict=True)
             hidden = self._hidden(name).ravel()
             rows += [_Row(*row) for row, is_hidden in zip(both, hidden, strict=True) if is_hidden]

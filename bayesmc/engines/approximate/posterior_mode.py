@@ -5,10 +5,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Never
 
 import numpy as np
 
+from bayesmc.distributions.parameters import by_keyword, refuse_positions
 from bayesmc.engines.approximate.evidence import log_constants
 from bayesmc.engines.approximate.modes import Mode, NoMode, modes_of
 from bayesmc.engines.approximate.question import free_density, is_number, refuse_jumps, start_points
@@ -81,10 +82,11 @@ class PosteriorMode:
         return f"PosteriorMode({shown}, log_density={self.log_density:.6g})"
 
 
+@by_keyword
 def map(  # noqa: A001 - the name that everybody knows it by
     net: BayesNet | FactorGraph,
     evidence: Mapping[str, Any] | None = None,
-    *,
+    *beyond: Never,
     inputs: Mapping[str, Any] | None = None,
     start: Mapping[str, Any] | None = None,
 ) -> PosteriorMode:
@@ -141,6 +143,8 @@ def map(  # noqa: A001 - the name that everybody knows it by
     >>> float(mode["rate"].round(6)), round(mode.log_density, 4)  # (2 + 8 - 1) / (1 + 3)
     (2.25, -6.6714)
     """
+    if beyond:
+        refuse_positions(map, beyond)
     problem = pose(net, evidence, inputs)
     target, density = _density(problem)
     full = free_density(problem, _also(problem), "map")

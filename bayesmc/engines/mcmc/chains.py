@@ -31,9 +31,10 @@ from bayesmc.engines.mcmc.groups import (
     state_of,
 )
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
-from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
+from bayesmc.engines.mcmc.loop import Kept, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.rounds import Lengths
 from bayesmc.engines.mcmc.saved import SavedChains, answer_so_far
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.unrolled import series_of
@@ -285,7 +286,7 @@ class ChainEngine(Engine):
             if not loop.draw(state, held, draws, bar, stop):
                 return False
             done = held.draws - before
-            if wanted is None or done >= lengths.draws:
+            if wanted is None or done >= lengths.most:
                 return True
             share = reached(wanted)
             if share >= 1:

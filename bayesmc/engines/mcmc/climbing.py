@@ -1,7 +1,8 @@
 """A start for chains where draws find none: free numbers moved until every term is finite.
 
 First the number of elements with density zero goes down, then the log density up; nothing here needs to be
-exact, since a start is only a start.
+exact, since a start is only a start. Hidden numbers count by their free numbers, and in comparison with the
+middle of their distribution: a density itself grows without end where a scale and all that it scales shrink.
 
 References
 ----------
@@ -20,6 +21,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import CompiledNode
+from bayesmc.network.probing import middle_of
 from bayesmc.structure.target import Target, Term, Values
 
 #: numbers that the largest term may have, over all rows that are evaluated at once
@@ -239,6 +241,8 @@ class Climb:
             if dead.any():
                 lost += dead.sum(axis=1)
                 far += np.where(dead, _distances(term, values, rows), 0.0).sum(axis=1)
+            if self.is_free.get(term.name):
+                part = part - self._middle(term, free[term.name], values, rows)
             log += np.where(dead, 0.0, part).sum(axis=1)
         kept = {n: values[n] for n in (*target.chain, *target.links)}
         return kept, Scores(lost, far, log)
@@ -260,6 +264,24 @@ class Climb:
         return np.where(
             np.isfinite(value), value, np.nan_to_num(value, posinf=1e300, neginf=-1e300)
         )
+
+    def _middle(self, term: Term, u: np.ndarray, values: Values, rows: int) -> np.ndarray:
+        """What a node's own density counts from, shape ``(rows, elements)``: that of its free numbers at the
+        middle, less the volume at ``u``; 0 for elements that were seen, or where there is no middle.
+        """
+        node, shape = term.model[term.name], (rows, *term.shape)
+        try:
+            dist, batch = term.distribution(values)
+            middle = middle_of(dist, (rows, *node.value_shape))
+            log = np.asarray(term.log_of(dist, batch, middle))
+            log = log + dist.log_abs_det_jacobian(dist.unconstrain(middle))
+            log = np.broadcast_to(log - dist.log_abs_det_jacobian(u), shape)
+        except (BayesmcError, ValueError):
+            return np.zeros((rows, math.prod(term.shape)))
+        seen = self.target.seen(term.name)
+        if seen is not None and seen.mask is not None:
+            log = np.where(seen.mask, 0.0, log)
+        return np.where(np.isfinite(log), log, 0.0).reshape(rows, -1)
 
     def _own(self, node: CompiledNode, values: Values) -> Distribution | None:
         if node.name not in self.target.terms:
@@ -303,7 +325,7 @@ def in_order(
     inside, links = set(target.chain), set(target.links)
     for name, node in target.model.nodes.items():
         if name in inside:
-            values[name] = _with_seen(target, node, value(node, values))
+            values[name] = target.with_seen(name, value(node, values))
         elif name in links:
             computed, _ = target.model.evaluate(name, values)
             values[name] = np.array(np.broadcast_to(computed, (rows, *node.value_shape)))
@@ -311,16 +333,6 @@ def in_order(
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _with_seen(target: Target, node: CompiledNode, value: np.ndarray) -> np.ndarray:
-    """Values of a node with what was observed of it put in place."""
-    seen = target.seen(node.name)
-    if seen is None:
-        return value
-    assert seen.mask is not None
-    mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
-    return np.where(mask, seen.value, value)
 
 
 def _wide(rows: np.ndarray, like: np.ndarray) -> np.ndarray:

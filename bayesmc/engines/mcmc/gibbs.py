@@ -11,6 +11,9 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.jointly import trajectories_of
@@ -20,6 +23,7 @@ from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.accepted import Accepted, finite_kernel, number_kernel
 from bayesmc.kernels.base import ANYHOW, How, Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
+from bayesmc.kernels.completed import completed_kernel, is_seen_in_part
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.ensemble import BlockWalk
@@ -32,7 +36,7 @@ from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import lattice_kernel, site_forest
-from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew
+from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew, some_support
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.rescaled import rescaled_kernels
 from bayesmc.kernels.slice import Slice
@@ -65,8 +69,8 @@ class Gibbs(ChainEngine):
     Parameters
     ----------
     draws : int, optional
-        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
-        warning that names the node.
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain
+        (up to twice that where it is nearly there) and a warning that names the node.
     warmup : int, optional
         Sweeps before that, in which widths and scales adapt; by default until chains have forgotten where
         they started, 1,000 at most (with ``draws``: 1,000).
@@ -87,7 +91,7 @@ class Gibbs(ChainEngine):
     ess : float
         Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
-        Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
+        Node -> where its chains start: what broadcasts to ``(*plates, *event)`` for all of them, or to
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
         these. What nothing observed depends on is drawn forward, wherever it starts.
     groups : int, optional
@@ -136,7 +140,7 @@ class Gibbs(ChainEngine):
         def planned(problem: Problem) -> None:
             self._plan(problem)
 
-        return refused(problem, "Gibbs", "has no kernel for this net", planned)
+        return refused(problem, "Gibbs", "has no kernel for this net", planned, takes_parts=True)
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return {row.node: str(row) for row in self.table(problem)}
@@ -189,7 +193,9 @@ def plan_of(
     if only is not None:
         key += f", only {sorted(only)}"
     if key not in problem.cache:
-        problem.cache[key] = _planned(problem, debug, only, how)
+        # kernels are tried on reachable values, at which numbers may put a parameter out of range
+        with marking_invalid(), np.errstate(all="ignore"):
+            problem.cache[key] = _planned(problem, debug, only, how)
     return problem.cache[key]
 
 
@@ -205,14 +211,18 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: H
     vectors = [
         b for b in vector_blocks(target, blankets, joined, debug) if governing(target, b, blankets)
     ]
+    in_part = [n for n, b in blankets.items() if is_seen_in_part(b)]
     blocks += vectors
     joined |= {n for b in vectors for n in b.names}
     forms = Forms(target)
     kernels, constraints = _finite(target, blankets, forms, debug)
+    completed = [completed_kernel(blankets[n]) for n in in_part if n not in joined]
+    joined |= set(in_part)
     left = [n for n in names if n not in joined and target.model[n].domain is None]
     conjugate, refusals = _conjugate(blankets, forms, left, debug)
     joints = [k.joint for k in kernels if isinstance(k, ForestBlock) and k.joint is not None]
     kernels += [k.reading(joints) if isinstance(k, Conjugate) else k for k in conjugate]
+    kernels += completed
     scales_of = [governing(target, block, blankets) for block in blocks]
     governed = {n for scales in scales_of for n in scales}
     closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]
@@ -362,11 +372,7 @@ def _numbers(
 
 def _kind(target: Target, blanket: Blanket) -> str:
     """The kind of a node's support, its bounds apart."""
-    support = blanket.node.support
-    if support is None:  # the bounds depend on parents
-        assert blanket.own is not None
-        support = blanket.own.distribution({**target.model.probe, **target.known})[0].support
-    return support.kind
+    return some_support(target.model, blanket.name, target.known).kind
 
 
 def _together(

@@ -11,7 +11,7 @@ from bayesmc.engines.proposal import check_targets
 from bayesmc.errors import EvidenceError, ShapeError
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.evidence import store
-from bayesmc.shapes import first_index
+from bayesmc.shapes import broadcasts_to, first_index
 
 
 def frozen_start(engine: str, start: Any) -> dict[str, Any] | None:
@@ -45,7 +45,8 @@ def read_start(
     Parameters
     ----------
     start : dict
-        Node -> value, shape ``(*plates, *event)``, or ``(chains, *plates, *event)`` with one for each chain.
+        Node -> value that broadcasts to ``(*plates, *event)``, or, with more axes than that, to
+        ``(chains, *plates, *event)``: one for each chain.
 
     Returns
     -------
@@ -69,15 +70,16 @@ def read_start(
 
 def _read(engine: str, problem: Problem, node: CompiledNode, value: Any, chains: int) -> np.ndarray:
     what = f"{engine}: start for {node.name!r}"
-    shape = np.shape(value)
-    wanted = node.value_shape
-    if shape not in (wanted, (chains, *wanted)):
+    shape, wanted = np.shape(value), node.value_shape
+    each = len(shape) > len(wanted)
+    if not broadcasts_to(shape, (chains, *wanted) if each else wanted):
         raise ShapeError(
             f"{what} has shape {shape}; give {wanted} for all chains (plates {node.plates}, then one value's "
-            f"shape), or {(chains, *wanted)} for each of the {chains}"
+            f"shape) or what broadcasts to it, such as one number, or {(chains, *wanted)} for each of the "
+            f"{chains}"
         )
     try:
-        stored = store(node, value)
+        stored = store(node, np.broadcast_to(value, (chains, *wanted) if each else wanted))
     except EvidenceError as error:
         raise EvidenceError(f"{what}: {error}") from None
     seen = problem.observed.get(node.name)

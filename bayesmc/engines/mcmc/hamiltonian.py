@@ -13,13 +13,14 @@ from typing import Any, ClassVar
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Plan, plan_of
-from bayesmc.engines.mcmc.jointly import continuous, density_of, jumping
+from bayesmc.engines.mcmc.jointly import continuous, density_of, jumping, summed_with
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.rescaled import rescaled_kernels
+from bayesmc.kernels.summed_out import SummedOut
 from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.compiled_density import in_machine_code
@@ -44,8 +45,8 @@ class HamiltonianMonteCarlo(ChainEngine):
     Parameters
     ----------
     draws : int, optional
-        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
-        warning that names the node.
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain
+        (up to twice that where it is nearly there) and a warning that names the node.
     warmup : int, optional
         Draws before that, in which the step and the metric are learnt from all chains together; by default
         until chains have forgotten where they started, 1,000 at most (with ``draws``: 1,000).
@@ -56,8 +57,14 @@ class HamiltonianMonteCarlo(ChainEngine):
         Transitions per kept draw.
     target_accept : float
         Mean acceptance that the step is learnt for; nearer to 1 steps are shorter, and follow sharper bends.
+        Where the warmup's length is left open and trajectories diverge in it, the step is learnt anew for one
+        nearer to 1: 0.95 in place of 0.8.
     max_depth : int
         Doublings of a trajectory, at most: up to ``2**max_depth - 1`` evaluations of the gradient for a draw.
+    marginalize : bool
+        Whether finite nodes are summed out of the density where they can be, and drawn given the numbers:
+        labels of a plate element by element, others by their joint states, at most 512 (`bmc.log_density`).
+        Labels and numbers that cling to each other mix so. Without it they are drawn in turn.
     metric : "diagonal" or "dense"
         Whether scales of all numbers are learnt, or their correlations, too: dense where a few hundred
         numbers at most are strongly correlated.
@@ -104,6 +111,7 @@ class HamiltonianMonteCarlo(ChainEngine):
     thinning: int = 1
     target_accept: float = 0.8
     max_depth: int = 10
+    marginalize: bool = False
     metric: Metric = "diagonal"
     threads: int = field(default=1, compare=False)
     debug: bool = False
@@ -124,12 +132,20 @@ class HamiltonianMonteCarlo(ChainEngine):
                 f"{what}(target_accept={self.target_accept!r}): target_accept is a share between 0 and "
                 "1, such as 0.8"
             )
+        if not isinstance(self.marginalize, bool):
+            raise ValueError(
+                f"{what}(marginalize={self.marginalize!r}): marginalize is True or False"
+            )
         if self.metric not in _METRICS:
             raise ValueError(f'{what}(metric={self.metric!r}): metric is "diagonal" or "dense"')
 
     def refusal(self, problem: Problem) -> str | None:
         return refused(
-            problem, type(self).__name__, "follows gradients, and this net has none", self._fits
+            problem,
+            type(self).__name__,
+            "follows gradients, and this net has none",
+            self._fits,
+            takes_parts=True,
         )
 
     def describe(self, problem: Problem) -> dict[str, str]:
@@ -143,7 +159,7 @@ class HamiltonianMonteCarlo(ChainEngine):
         text = super().effort(problem)
         if not moving:
             return text
-        density = density_of(problem, moving)
+        density = density_of(problem, moving, self.summed(problem))
         told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
         return f"{text}; {told}" if told else text
 
@@ -155,6 +171,11 @@ class HamiltonianMonteCarlo(ChainEngine):
         sampler = SweepSampler(plan.target, plan.kernels)
         sampler.climbs = True
         return sampler
+
+    def summed(self, problem: Problem) -> tuple[str, ...]:
+        """Finite nodes that are summed out."""
+        moving = self._moving(problem) if self.marginalize else ()
+        return summed_with(problem, moving) if moving else ()
 
     def _fits(self, problem: Problem) -> str | None:
         """Why it has nothing to move."""
@@ -177,12 +198,13 @@ class HamiltonianMonteCarlo(ChainEngine):
         """Kernels of what is finite, and one for all that is continuous."""
         target = target_of(problem)
         moving = self._moving(problem)
-        rest = [n for n in target.chain if n not in moving]
+        summed = self.summed(problem)
+        rest = [n for n in target.chain if n not in (*moving, *summed)]
         plan = plan_of(problem, only=rest)
         if not moving:
             return plan
-        density = density_of(problem, moving)
-        kernel = Hamiltonian(
+        density = density_of(problem, moving, summed)
+        kernel = (SummedOut if summed else Hamiltonian)(
             density,
             density.others,
             warmup=self.warmup,

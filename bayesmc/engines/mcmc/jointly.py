@@ -13,6 +13,7 @@ from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.network import Problem
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.jumps import jumps
+from bayesmc.structure.summing import components
 from bayesmc.structure.target import Target, target_of
 from bayesmc.structure.unconstrained import unconstrained_density
 
@@ -30,23 +31,42 @@ def continuous(target: Target) -> tuple[str, ...]:
     return tuple(n for n, node in nodes if not node.is_discrete and node.domain is None)
 
 
-def density_of(problem: Problem, names: tuple[str, ...]) -> UnconstrainedDensity:
-    """The density of some nodes given the rest, made once.
+def density_of(
+    problem: Problem, names: tuple[str, ...], summed: tuple[str, ...] = ()
+) -> UnconstrainedDensity:
+    """The density of some nodes given the rest, with some finite nodes summed out, made once.
 
     Raises
     ------
     UnsupportedError
-        It cannot be followed, or has no derivative.
+        It cannot be followed, or has no derivative; or too many states would have to be summed over.
     """
     found = problem.cache.setdefault("densities of free numbers", {})
-    if names not in found:
+    if (names, summed) not in found:
         try:
-            found[names] = unconstrained_density(target_of(problem), names)
+            found[names, summed] = unconstrained_density(target_of(problem), names, summed)
         except UnsupportedError as error:
-            found[names] = str(error)
-    if isinstance(found[names], str):
-        raise UnsupportedError(found[names])
-    return found[names]
+            found[names, summed] = str(error)
+    if isinstance(found[names, summed], str):
+        raise UnsupportedError(found[names, summed])
+    return found[names, summed]
+
+
+def summed_with(problem: Problem, moving: tuple[str, ...]) -> tuple[str, ...]:
+    """Finite nodes of the chain that can be summed out of the density of nodes that move.
+
+    What hangs together is summed out together or not at all.
+    """
+    target = target_of(problem)
+    finite = [n for n in target.chain if n not in moving and target.model[n].domain is not None]
+    found: list[str] = []
+    for group in components(target, finite):
+        try:
+            density_of(problem, moving, tuple(group))
+        except UnsupportedError:
+            continue
+        found += group
+    return tuple(n for n in target.chain if n in found)
 
 
 def jumping(problem: Problem, density: UnconstrainedDensity) -> frozenset[str]:

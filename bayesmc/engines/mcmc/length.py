@@ -22,7 +22,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.engines.mcmc.convergence import MAX_RHAT, by_chance
-from bayesmc.engines.mcmc.loop import Lengths
+from bayesmc.engines.mcmc.rounds import Lengths
 from bayesmc.engines.mcmc.screening import some_scalars, uncut
 from bayesmc.network import Model, Problem
 from bayesmc.results.relabelling import ordered, pivot_of, symmetries
@@ -36,8 +36,8 @@ LEAST, _MOST, _EACH = 4, 256, 8
 _SUPERCHAINS, _MEMBERS = 8, 2
 #: sweeps of a warmup where none are said, at most where its end is judged
 WARMUP = 1000
-#: draws of each chain after which one that did not get to its effective size gives up, and numbers that
-#: are kept at most if these are enough for ``_FEWEST`` draws
+#: draws of each chain after which one gives up that has not got to its effective size, nor nearly so, and
+#: numbers that are kept at most by then if these are enough for ``_FEWEST`` draws
 _BUDGET, _KEPT, _FEWEST = 4000, 1 << 24, 1000
 #: numbers by which the end of a warmup is judged, at most, and draws of each chain that are not thinned away
 _FEW = 16
@@ -147,7 +147,8 @@ def in_words(lengths: Lengths, problem: Problem) -> str:
         return f"{many}, {warm}, {lengths.draws} draws of each"
     return (
         f"{many} of some {size_of(problem)} numbers each, {warm}, then draws until the smallest effective "
-        f"size is {lengths.ess:g}, at most {lengths.draws} of each chain"
+        f"size is {lengths.ess:g}, at most {lengths.draws} of each chain, "
+        f"or up to {lengths.most} if these will do"
     )
 
 

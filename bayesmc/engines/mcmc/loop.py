@@ -6,25 +6,17 @@ A sampler moves all chains by one sweep; what a sweep does is not known here.
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.mcmc.rounds import Lengths
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Patience, Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
-
-#: the first sweep at which a warmup may end where that is judged
-_END = 100
-#: draws of each chain from which on a run may be seen not to get to its effective size
-_HOPELESS = 500
-#: draws of each chain in the first round, at least, and how much longer a later round may make a run
-_ROUND, _GROWTH = 16, 3.0
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, which can be saved
 State = Mapping[str, Any]
@@ -43,7 +35,8 @@ class Sampler(Protocol):
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
     Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
-    ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged, and
+    ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged,
+    ``unsettled(state)`` says whether it should not end yet, and
     ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None, and
     ``energies(state)`` the energy of each chain's last one.
     ``superchains`` (0) is set before the start, where so many groups of chains are to start as one.
@@ -75,57 +68,6 @@ class Sampler(Protocol):
     def acceptance(self, state: State) -> Mapping[str, np.ndarray]:
         """Block -> share of proposals accepted since the warmup, shape (chain,)."""
         ...
-
-
-@dataclass(frozen=True)
-class Lengths:
-    """What a run makes.
-
-    Attributes
-    ----------
-    chains : int
-    warmup : int
-        Sweeps; at most, where there is a ``judge``.
-    draws : int
-        Of each chain; at most, where there is an ``ess``.
-    superchains : int
-        Groups of consecutive chains that start as one; 0 where every chain starts by itself.
-    ess : float or None
-        Effective size after which nothing more is drawn.
-    judge : callable or None
-        Whether draws of a warmup, some nodes' stored values, tell nothing of their starts any more.
-    """
-
-    chains: int
-    warmup: int
-    draws: int
-    superchains: int = 0
-    ess: float | None = None
-    judge: Callable[[Mapping[str, np.ndarray]], bool] | None = None
-
-    def ends(self) -> Iterator[int]:
-        """Sweeps at which the warmup may end."""
-        end = _END
-        while self.judge is not None and end < self.warmup:
-            yield end
-            end *= 2
-        yield self.warmup
-
-    def first(self) -> int:
-        """Draws of each chain in the first round."""
-        if self.ess is None:
-            return self.draws
-        return min(max(math.ceil(self.ess / self.chains), _ROUND), self.draws)
-
-    def further(self, made: int, share: float) -> int:
-        """Draws of each chain in the next round, where those made are a share of what is wanted.
-
-        None where even all that are allowed would not do.
-        """
-        if made >= _HOPELESS and share * self.draws < 0.5 * made:
-            return 0
-        needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
-        return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
 
 
 class Begun(NamedTuple):
@@ -213,12 +155,19 @@ class Loop:
                 if end < self.sweep:  # passed before this process
                     continue
                 state, window = self._warmed(state, end, bar, stop, window)
-                if window is not None and self.lengths.judge(window.frozen()):  # type: ignore[misc]
+                if window is not None and self._may_end(state, window):
                     break
                 window = None
             self.warmup = self.sweep
             self.sweep, self.phase = 0, ""
             return self.sampler.end_warmup(state)
+
+    def _may_end(self, state: State, window: Kept) -> bool:
+        """Whether a warmup has forgotten its starts, and no kernel has just begun to learn anew."""
+        unsettled = getattr(self.sampler, "unsettled", None)
+        if unsettled is not None and unsettled(state):
+            return False
+        return self.lengths.judge(window.frozen())  # type: ignore[misc]
 
     def _started(self) -> State:
         try:

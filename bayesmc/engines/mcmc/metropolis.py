@@ -56,8 +56,8 @@ class MetropolisHastings(ChainEngine):
     Parameters
     ----------
     draws : int, optional
-        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
-        warning that names the node.
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain
+        (up to twice that where it is nearly there) and a warning that names the node.
     warmup : int, optional
         Sweeps before that, in which scales and covariances adapt; 1,000 by default.
     chains : int, optional
@@ -79,7 +79,7 @@ class MetropolisHastings(ChainEngine):
     ess : float
         Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
-        Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
+        Node -> where its chains start: what broadcasts to ``(*plates, *event)`` for all of them, or to
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
         these. What nothing observed depends on is drawn forward, wherever it starts.
     groups : int, optional

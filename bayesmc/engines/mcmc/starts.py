@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.categorical import pick_log
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, in_order, largest_term, row_logs
-from bayesmc.engines.mcmc.labelled import relabelled
+from bayesmc.engines.mcmc.labelled import Labels, relabelled
 from bayesmc.errors import (
     BayesmcError,
     DensityError,
@@ -76,6 +76,7 @@ def start_states(
             break
         if spread == 1.0 and not found.alive:
             refuse_impossible(target, found.tried, found.given)
+            found.ask_for_labels()
     free = [n for n in target.chain if n not in found.given]
     moves = any(target.model[n].domain is None for n in free)  # numbers and counts
     if search and moves and not found.alive:
@@ -103,6 +104,8 @@ class _Search:
         #: some states, whatever their density, and the best of those that were searched for
         self.tried: Values = {}
         self.nearest: Values = {}
+        #: hidden labels, where they are drawn given all else
+        self.labels: Labels | None = None
 
     @property
     def complete(self) -> bool:
@@ -119,6 +122,13 @@ class _Search:
             self._attempt(spread, min(attempts, max(room, _ATTEMPTS)))
             attempts -= max(room, _ATTEMPTS)
 
+    def ask_for_labels(self) -> None:
+        """From now on labels are drawn given all else: forward draws of all of them were impossible."""
+        labels = Labels(self.target, self.given)
+        if labels:
+            self.labels = labels
+            self.attempt(1.0, _ATTEMPTS)
+
     def climb(self) -> None:
         """Free numbers moved uphill, for some chains."""
         rows = min(self.chains, _SEARCHERS)
@@ -127,7 +137,10 @@ class _Search:
         def draw(count: int) -> Values:
             spread = float(self.rng.choice(_SPREADS))
             filled = {n: np.repeat(v, count // rows, axis=0) for n, v in given.items()}
-            return _drawn_all(self.target, count, spread, self.rng, filled)[0]
+            drawn = _drawn_all(self.target, count, spread, self.rng, filled)[0]
+            if self.labels is not None:
+                self.labels.draw(drawn, self.rng)
+            return drawn
 
         try:
             values, scores = Climb(self.target, given, rows, self.rng, draw).climbed()
@@ -145,7 +158,13 @@ class _Search:
         given = {n: np.tile(v, (attempts,) + (1,) * (v.ndim - 1)) for n, v in self.given.items()}
         try:
             values, log, is_told = _attempt(
-                self.target, self.chains * attempts, spread, self.rng, self.culprits, given
+                self.target,
+                self.chains * attempts,
+                spread,
+                self.rng,
+                self.culprits,
+                given,
+                self.labels,
             )
         except ParameterError as error:
             self.failure = error
@@ -210,8 +229,9 @@ def refuse_impossible(target: Target, tried: Values, given: Collection[str] = ()
         if term.is_potential or name in target.chain or name not in target.known:
             continue
         above = target.hidden_above(term)
-        if any(n in given or target.model[n].domain is not None for n in above):
-            continue  # another value, or a state that was not drawn, may allow it
+        nodes = [target.model[n] for n in above]
+        if any(n.name in given or n.is_discrete or n.domain is not None for n in nodes):
+            continue  # another value, or a state or count that was not drawn, may allow it
         dist, _ = term.distribution(values)
         support, value = dist.support, np.asarray(target.known[name])
         if support.kind not in ("interval", "integers") or target.model[name].event_shape:
@@ -286,6 +306,7 @@ def _attempt(
     rng: np.random.Generator,
     culprits: dict[str, int],
     given: Values,
+    labels: Labels | None = None,
 ) -> tuple[Values, np.ndarray, bool]:
     """Forward draws of the chain's nodes, and the log density of what was seen given them.
 
@@ -298,17 +319,21 @@ def _attempt(
             found = relabelled(target, name, values, rng)
             if found is not None:
                 log, told = log + found[1], told | found[0]
+    if labels is not None:
+        labels.draw(values, rng)
     for name, wrong in undefined.items():
         log = np.where(wrong, -np.inf, log)
         if wrong.all():
             culprits[name] = culprits.get(name, 0) + 1
     inside = set(target.chain)
     for term in target.terms.values():
-        if term.name in inside and target.seen(term.name) is None and term.name not in given:
+        is_drawn = term.name in inside and target.seen(term.name) is None and term.name not in given
+        if is_drawn and labels is None:
             continue
         part = row_logs(term, values, count)
         part = part.sum(axis=tuple(range(1, part.ndim)))
-        log = np.where(part > -np.inf, log, -np.inf) if term.name in told else log + part
+        is_counted = is_drawn or term.name in told
+        log = np.where(part > -np.inf, log, -np.inf) if is_counted else log + part
         if not (log > -np.inf).any():
             culprits[term.name] = culprits.get(term.name, 0) + 1
             break

@@ -16,6 +16,7 @@ from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.engines.mcmc.uphill import uphill
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.redrawn import renewals
 from bayesmc.network import Problem
 from bayesmc.network.forward import Pass, refuse_noiseless, refuse_parts, run
@@ -61,7 +62,7 @@ class SweepSampler:
         for i, kernel in enumerate(self.kernels):
             new, memory[i] = kernel.step(values, memory[i], rng, warmup)
             if i >= self._checked:  # each kernel once
-                _check_moved(kernel, new, values)
+                _check_moved(self.target, kernel, new, values)
                 self._checked = i + 1
             values.update(new)
             self.target.refresh(values, kernel.names)
@@ -70,6 +71,11 @@ class SweepSampler:
     def end_warmup(self, state: Mapping[str, Any]) -> Any:
         memory = [k.end_warmup(m) for k, m in zip(self.kernels, state["memory"], strict=True)]
         return {**state, "memory": memory}
+
+    def unsettled(self, state: Mapping[str, Any]) -> bool:
+        """Whether a kernel has only just begun to learn anew, so that a warmup should not end yet."""
+        pairs = zip(self.kernels, state["memory"], strict=True)
+        return any(k.unsettled(m) for k, m in pairs if isinstance(k, Hamiltonian))
 
     def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
         return self.completed(state["values"], state["chains"], rng)
@@ -139,7 +145,11 @@ def block_name(kernel: Kernel) -> str:
 
 
 def refused(
-    problem: Problem, who: str, words: str, planned: Callable[[Problem], str | None]
+    problem: Problem,
+    who: str,
+    words: str,
+    planned: Callable[[Problem], str | None],
+    takes_parts: bool = False,
 ) -> str | None:
     """Why an engine whose kernels sweep over a net cannot answer; None where it can.
 
@@ -152,8 +162,10 @@ def refused(
         What is said before the reason where something is unsupported: "has no kernel for this net".
     planned : callable
         Makes the plan, or says why there is none.
+    takes_parts : bool
+        Whether its kernels leave components alone that were seen of vectors seen in part.
     """
-    parts = refuse_parts(problem.observed, who)
+    parts = None if takes_parts else refuse_parts(problem.observed, who)
     if parts is not None:
         return parts
     try:
@@ -175,7 +187,9 @@ def _apart(target: Target) -> frozenset[str]:
     return frozenset(target.forward) - moved
 
 
-def _check_moved(kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+def _check_moved(
+    target: Target, kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, Any]
+) -> None:
     """Refuse what is no move of a kernel's nodes: of a kernel that somebody wrote, this may be."""
     step = f"{type(kernel).__name__}.step"
     for name in kernel.names:
@@ -189,3 +203,8 @@ def _check_moved(kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, An
             )
         if not np.isfinite(new[name]).all():
             raise ModelError(f"{step} returned {name!r} with values that are not finite")
+        if (target.with_seen(name, new[name]) != new[name]).any():
+            raise ModelError(
+                f"{step} returned {name!r} with other values than were observed of it; put these in their "
+                "place (target.with_seen)"
+            )

@@ -20,6 +20,7 @@ import numpy as np
 
 from bayesmc.engines.mcmc.convergence import scalar_name
 from bayesmc.kernels.hamiltonian import Hamiltonian
+from bayesmc.kernels.rescaled import Rescaled
 from bayesmc.results import ChainsPosterior, ChainsSums
 
 #: share of trajectories that may diverge by chance, as at the edge of a support
@@ -52,9 +53,8 @@ def faulty_trajectories(
         if diverged > _CHANCE * moves:
             yield (
                 f"{diverged} of {moves} trajectories diverged{_where(posterior, kernel)}: the density bends "
-                "there more sharply than their steps can follow, and draws leave it out; declare effects "
-                "apart from their scale (z ~ Normal(0, 1), b = sigma * z), give tighter priors, or "
-                f"{_shorter(posterior)}"
+                "there more sharply than their steps can follow, and draws leave it out; "
+                f"{_apart_from(kernel, kernels)}give tighter priors, or {_shorter(posterior, memory)}"
             )
         cut = int(memory["saturated"].sum())
         if cut > _CUT * moves:
@@ -66,19 +66,40 @@ def faulty_trajectories(
         if ratio < _LEAST_RATIO:
             yield (
                 f"energies change slowly (E-BFMI {ratio:.2f}, under {_LEAST_RATIO}): heavy tails or a funnel "
-                "are not explored; declare effects apart from their scale, or heavy tails as a scale mixture"
+                f"are not explored; {_apart_from(kernel, kernels)}declare heavy tails as a scale "
+                "mixture, or give tighter priors"
             )
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _shorter(posterior: ChainsPosterior | ChainsSums) -> str:
+def _apart_from(kernel: Hamiltonian, kernels: list[Any]) -> str:
+    """Effects that are to be declared apart from their scale, in words; empty where all are."""
+    scaled = next((k for k in kernels if isinstance(k, Rescaled)), None)
+    if scaled is not None:
+        return (
+            f"declare {', '.join(map(repr, scaled.below))} apart from the scale {scaled.name!r} "
+            "(z ~ Normal(0, 1), b = sigma * z), "
+        )
+    target: Any = getattr(kernel.density, "target", None)
+    if target is None:
+        return ""
+    terms, moved = target.terms, kernel.density.names
+    if any(
+        set(moved).intersection(target.hidden_above(terms[n])) - {n} for n in moved if n in terms
+    ):
+        return "declare effects apart from their scale (z ~ Normal(0, 1), b = sigma * z), "
+    return ""
+
+
+def _shorter(posterior: ChainsPosterior | ChainsSums, memory: Mapping[str, Any]) -> str:
     """How steps are made shorter, in words."""
+    used = memory["step"].get("target", 0.8)
+    higher = " or ".join(f"{a:g}" for a in (0.95, 0.99, 0.999) if a > used + 1e-9)
     known = getattr(posterior.engine, "target_accept", None)
     if known is None:
-        return "use HamiltonianMonteCarlo(target_accept=0.95)"
-    higher = " or ".join(f"{a:g}" for a in (0.95, 0.99, 0.999) if a > known)
+        return f"use HamiltonianMonteCarlo(target_accept={higher.split()[0]})"
     return f"raise target_accept={known:g} ({higher})" if higher else "another engine"
 
 
@@ -91,7 +112,7 @@ def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> str:
         return ""
     found: list[tuple[float, str]] = []
     left = _NUMBERS
-    for name in kernel.names:
+    for name in kernel.density.names:
         stored = posterior._stored.get(name)
         if stored is None or left < diverged.size:
             continue
