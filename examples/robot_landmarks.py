@@ -110,9 +110,7 @@ def ellipse(centre: np.ndarray, cov: np.ndarray, deviations: float = 2.0) -> np.
 # ---- generated logs -------------------------------------------------------------------------------
 
 
-def write_mrclam(
-    folder: Path, seconds: float = 200.0, seed: int = 1, depths: bool = False
-) -> Path:
+def write_mrclam(folder: Path, seconds: float = 200.0, seed: int = 1, depths: bool = False) -> Path:
     """A folder as `read_mrclam` expects it, of one robot among 15 landmarks.
 
     Its wheels say a tenth too much, bearings are a degree off, and one in a hundred is of something else.

@@ -33,7 +33,11 @@ from examples.robot_landmarks import Drive, ellipse, marks_seen, write_mrclam
 
 SPREAD, LASTING = 0.07, 200.0  # of the wheels' gains, as in `landmark_localization`
 PER_METRE, PER_RADIAN, PER_SECOND = 5e-4, 1e-2, 1e-4  # variances that build up, in m^2 and rad^2
-LONG, FAR, LATE = 0.02, 0.04, 0.033  # of the camera: share and m that depths are too long by, s of delay
+LONG, FAR, LATE = (
+    0.02,
+    0.04,
+    0.033,
+)  # of the camera: share and m that depths are too long by, s of delay
 # Wider than one error, which lasts over many readings: m, share of what is read, rad
 DEPTH, SHARE, BEARING = 0.1, 0.02, 0.03
 STRAY = 0.002  # share of readings that wear the barcode of another landmark
@@ -54,9 +58,9 @@ class Readings(NamedTuple):
     A slice has ``K`` readings, or fewer and NaN. ``which`` is whose they are, -1 where nothing was read; in
     `one_by_one` a slice has one reading and no axis for them.
 
-    One row for each slice: times (T,), motion (T, 3) since the slice before, ``bend`` (T, 3, 2), how that moves
-    with the gains of the wheels, ``noise`` (T, 3, 3), the covariance that built up on the way, seconds (T,),
-    spin (T,) in rad/s, which (T, K), seen (T, K, 2), truth (T, 3).
+    One row for each slice: times (T,), motion (T, 3) since the slice before, ``bend`` (T, 3, 2), how that
+    moves with the gains of the wheels, ``noise`` (T, 3, 3), the covariance that built up on the way, seconds
+    (T,), spin (T,) in rad/s, which (T, K), seen (T, K, 2), truth (T, 3).
     """
 
     times: np.ndarray
@@ -122,7 +126,11 @@ class _Way:
         shift = np.eye(3)  # what stands before moves with the heading
         shift[:2, 2] = -y, x
         halfway = 0.5 * angle  # a gain of the turn bends the arc by half of it
-        gains = turn @ [[motion[0], -halfway * motion[1]], [motion[1], halfway * motion[0]], [0, angle]]
+        gains = turn @ [
+            [motion[0], -halfway * motion[1]],
+            [motion[1], halfway * motion[0]],
+            [0, angle],
+        ]
         place = PER_METRE * effort[0] + 1e-8
         heading = PER_RADIAN * effort[1] + PER_SECOND * effort[2] + 1e-8
         own = turn @ np.diag([place, place, heading]) @ turn.T
@@ -213,9 +221,7 @@ def read_or_stray(read: tuple[Any, Any], none: Any, depth: Any, bearing: Any) ->
     far, angle = read
     return AndAngle(
         bmc.Normal(np.where(none, ANYWHERE, far), np.where(none, ANYWHERE_DEPTH, depth)),
-        bmc.WrappedNormal(
-            np.where(none, 0.0, angle), np.where(none, ANYWHERE_BEARING, bearing)
-        ),
+        bmc.WrappedNormal(np.where(none, 0.0, angle), np.where(none, ANYWHERE_BEARING, bearing)),
     )
 
 
@@ -457,7 +463,7 @@ def picks(
 
 
 def ceilings(readings: Readings, marks: np.ndarray) -> dict[str, float]:
-    """Shares right of who knows every pose and the map, and looks at readings (one in a slice) as independent.
+    """Shares right of who knows all poses and the map, and looks at readings, one in a slice, as independent.
 
     The nearest landmark, by deviations of depth and bearing; the same with each landmark once in an instant;
     and with what is off by the robot's own camera, a line in the depth and one in the bearing, taken away.
@@ -484,8 +490,9 @@ def ceilings(readings: Readings, marks: np.ndarray) -> dict[str, float]:
     usual = (np.abs(off[own]) < 8 * near).all(axis=-1)  # without what is far off
     mended = off.copy()
     for k in range(2):
-        line = np.polyfit(read[own][usual, k], off[own][usual, k], 1)
-        mended[..., k] -= np.polyval(line, read[..., k])
+        lines = np.stack([np.ones_like(read[..., k]), read[..., k]], axis=-1)
+        slope = np.linalg.lstsq(lines[own][usual], off[own][usual, k], rcond=None)[0]
+        mended[..., k] -= lines @ slope
     return {
         "told all: nearest": float((cost.argmin(axis=1) == which).mean()),
         "each once": once(cost),
@@ -530,7 +537,9 @@ def log(fast: bool) -> tuple[str, Drive]:
     if folder is not None and not fast:
         return "MRCLAM 6, robot 1", marks_seen(folder, 1)
     with tempfile.TemporaryDirectory() as made:
-        return "a generated drive", marks_seen(write_mrclam(Path(made), 60.0 if fast else 200.0, depths=True), 1)
+        return "a generated drive", marks_seen(
+            write_mrclam(Path(made), 60.0 if fast else 200.0, depths=True), 1
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -63,7 +63,9 @@ def test_a_camera_reads_depths_and_is_late() -> None:
 def test_the_way_between_readings_is_what_the_stretches_add_up_to() -> None:
     """Motion to rounding; how it moves with the gains, and its covariance, against differences and draws."""
     rng = np.random.default_rng(3)
-    motion = np.column_stack([rng.uniform(0.1, 0.3, 6), rng.normal(0, 0.02, 6), rng.normal(0, 0.2, 6)])
+    motion = np.column_stack(
+        [rng.uniform(0.1, 0.3, 6), rng.normal(0, 0.02, 6), rng.normal(0, 0.2, 6)]
+    )
     effort = np.column_stack([motion[:, 0], np.abs(motion[:, 2]), np.ones(6)])
     seen = np.full((6, 2, 2), np.nan)
     seen[5, 1] = 2.0, 0.1
@@ -89,10 +91,10 @@ def test_the_way_between_readings_is_what_the_stretches_add_up_to() -> None:
         some = 1e-6 * np.eye(2)[k]
         slope = (gone(1 + some, still) - gone(1 - some, still)) / 2e-6
         np.testing.assert_allclose(found.bend[1, :, k], slope, rtol=1e-6, atol=1e-9)
-    # 20,000 draws tell a covariance to 1 in 100: entries are held to five of that (false alarms below 1e-5)
+    # 4,000 draws tell a covariance to 1 in 45: entries are held to five of that (false alarms below 1e-5)
     place = slam_landmarks.PER_METRE * effort[:, 0]
     heading = slam_landmarks.PER_RADIAN * effort[:, 1] + slam_landmarks.PER_SECOND * effort[:, 2]
-    noise = rng.normal(size=(20_000, 6, 3)) * np.sqrt(np.column_stack([place, place, heading]))
+    noise = rng.normal(size=(4_000, 6, 3)) * np.sqrt(np.column_stack([place, place, heading]))
     cov = np.cov(np.array([gone(np.ones(2), n) for n in noise]).T)
     scale = np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
-    assert (np.abs(found.noise[1] - cov) < 0.05 * scale).all()
+    assert (np.abs(found.noise[1] - cov) < 0.11 * scale).all()
