@@ -110,10 +110,11 @@ def ellipse(centre: np.ndarray, cov: np.ndarray, deviations: float = 2.0) -> np.
 # ---- generated logs -------------------------------------------------------------------------------
 
 
-def write_mrclam(folder: Path, seconds: float = 200.0, seed: int = 1) -> Path:
+def write_mrclam(folder: Path, seconds: float = 200.0, seed: int = 1, depths: bool = False) -> Path:
     """A folder as `read_mrclam` expects it, of one robot among 15 landmarks.
 
     Its wheels say a tenth too much, bearings are a degree off, and one in a hundred is of something else.
+    With ``depths`` it reads, as the robots of MRCLAM do, how deep landmarks stand along its camera's axis.
     """
     rng = np.random.default_rng(seed)
     times, poses, v, omega = _driven(seconds, 0.02, (0.12, 0.25), rng)
@@ -126,7 +127,8 @@ def write_mrclam(folder: Path, seconds: float = 200.0, seed: int = 1) -> Path:
         for j in np.flatnonzero((distance < 4.0) & (np.abs(angle) < 0.6)):
             off = rng.uniform(-0.6, 0.6) if rng.random() < 0.01 else angle[j]
             noise = rng.standard_normal(2) * (0.15, 0.02)
-            rows.append((times[k], 101 + j, abs(distance[j] + noise[0]), off + noise[1]))
+            far = distance[j] * np.cos(angle[j]) if depths else distance[j]
+            rows.append((times[k], 101 + j, abs(far + noise[0]), off + noise[1]))
     number = np.arange(6, 21)
     stand = np.column_stack([number, marks, np.full((15, 2), 1e-4)])
     tables = {

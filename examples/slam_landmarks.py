@@ -27,85 +27,169 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import AndAngle, PoseNormal, bearing_to, compose, range_to, wrap
+from bayesmc.robotics import AndAngle, PoseNormal, bearing_to, compose, range_to, transform, wrap
 from examples import picture, reference
 from examples.robot_landmarks import Drive, ellipse, marks_seen, write_mrclam
 
 SPREAD, LASTING = 0.07, 200.0  # of the wheels' gains, as in `landmark_localization`
-PER_METRE, PER_RADIAN, PER_SECOND = 5e-4, 1e-2, 1e-5  # variances that build up, in m^2 and rad^2
+PER_METRE, PER_RADIAN, PER_SECOND = 5e-4, 1e-2, 1e-4  # variances that build up, in m^2 and rad^2
+LONG, FAR, LATE = (
+    0.02,
+    0.04,
+    0.033,
+)  # of the camera: share and m that depths are too long by, s of delay
 # Wider than one error, which lasts over many readings: m, share of what is read, rad
-RANGE, SHARE, BEARING = 0.3, 0.1, 0.05
+DEPTH, SHARE, BEARING = 0.1, 0.02, 0.03
 STRAY = 0.002  # share of readings that wear the barcode of another landmark
 # m, m, rad: what a reading of no landmark, or of another one, is about
-ANYWHERE, ANYWHERE_RANGE, ANYWHERE_BEARING = 4.0, 2.0, 0.5
+ANYWHERE, ANYWHERE_DEPTH, ANYWHERE_BEARING = 4.0, 2.0, 0.5
 VAGUE, GUESSED = 30.0, 2.0  # m: standard deviations of a landmark's place beforehand
 # Where it is not known which landmark is read:
-OFF, LASTS = 0.05, 5.0  # shares that ranges are off by, and the seconds for which they are
-FAST_RANGE, FAST_BEARING = 0.06, 0.015  # m, rad: what is left, another in each reading
+FAST_DEPTH, FAST_BEARING = 0.06, 0.012  # m, rad: what is off by itself in each reading
+AIM = 0.008  # rad: what all bearings of an instant are off by
 EAGER, CLUTTER = 3.0, 0.0005  # to meet new landmarks; share of readings that are of none
-NEAR_RANGE, NEAR_BEARING = 0.15, 0.02  # m, rad: by which nearness is judged
+NEAR_DEPTH, NEAR_BEARING = 0.05, 0.012  # m, rad: by which nearness is judged
 PLACES, HALL = 25, 8.0  # landmarks that a map has room for; m, how far they stand
 
 
 class Readings(NamedTuple):
-    """A drive with one reading in a slice: ``which`` is its landmark, -1 where nothing was read.
+    """A drive as a filter gets it: a slice for each instant at which something was read.
 
-    One row for each slice: times (T,), motion and effort (T, 3), which (T,), seen (T, 2), truth (T, 3).
+    A slice has ``K`` readings, or fewer and NaN. ``which`` is whose they are, -1 where nothing was read; in
+    `one_by_one` a slice has one reading and no axis for them.
+
+    One row for each slice: times (T,), motion (T, 3) since the slice before, ``bend`` (T, 3, 2), how that
+    moves with the gains of the wheels, ``noise`` (T, 3, 3), the covariance that built up on the way, seconds
+    (T,), spin (T,) in rad/s, which (T, K), seen (T, K, 2), truth (T, 3).
     """
 
     times: np.ndarray
     motion: np.ndarray
-    effort: np.ndarray
+    bend: np.ndarray
+    noise: np.ndarray
+    seconds: np.ndarray
+    spin: np.ndarray
     which: np.ndarray
     seen: np.ndarray
     truth: np.ndarray
 
     @property
     def inputs(self) -> dict[str, np.ndarray]:
-        return {"motion": self.motion, "effort": self.effort}
+        """What all nets are told of the drive."""
+        return {k: getattr(self, k) for k in ("motion", "bend", "noise", "seconds", "spin")}
 
     def rmse(self, poses: np.ndarray) -> float:
-        """Root mean square over time of the distance from the truth, in m."""
-        lasts = np.diff(self.times, append=self.times[-1])
+        """Root mean square of the distance from the truth, in m, over the slices where it is known."""
         square = np.square(poses[:, :2] - self.truth[:, :2]).sum(axis=-1)
-        known = np.isfinite(square)
-        return float(np.sqrt((square * lasts)[known].sum() / lasts[known].sum()))
+        return float(np.sqrt(np.nanmean(square)))
 
 
-def one_by_one(drive: Drive, upto: float = np.inf) -> Readings:
-    """Slices of a drive with one reading each; readings of one instant follow each other without moving."""
-    rows: list[tuple[int, int]] = []
+def instants(drive: Drive, upto: float = np.inf) -> Readings:
+    """Slices of a drive at which something was read; what the wheels said in between is added up.
+
+    The way between two instants is one motion, with the noise that builds up on it. A filter that drew a turn
+    in every second of a minute without landmarks could not take back the first when it sees one again; drawn
+    as a whole, with a look at what is read at its end, the way can lead there.
+    """
+    some = np.isfinite(drive.seen[..., 0])
+    most = max(int(some.sum(axis=1).max()), 1)
+    rows: list[tuple[Any, ...]] = []
+    way = _Way()
     for k in np.flatnonzero(drive.times <= upto):
-        found = np.flatnonzero(np.isfinite(drive.seen[k, :, 0]))
-        rows += [(k, j) for j in found] or [(k, -1)]
-    at, which = np.array(rows).T
-    moves = np.diff(at, prepend=-1)[:, None] > 0
-    seen = np.where((which >= 0)[:, None], drive.seen[at, which], np.nan)
-    motion, effort = np.where(moves, drive.motion[at], 0.0), np.where(moves, drive.effort[at], 0.0)
-    return Readings(drive.times[at], motion, effort, which, seen, drive.truth[at])
+        way.drive(drive.motion[k], drive.effort[k])
+        if rows and not some[k].any():
+            continue
+        own = np.flatnonzero(some[k])
+        which, seen = np.full(most, -1), np.full((most, 2), np.nan)
+        which[: len(own)], seen[: len(own)] = own, drive.seen[k, own]
+        spin = drive.motion[k, 2] / drive.effort[k, 2] if drive.effort[k, 2] > 0 else 0.0
+        rows.append((drive.times[k], *way.told, spin, which, seen, drive.truth[k]))
+        way = _Way()
+    return Readings(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def robot(start: np.ndarray, places: int) -> bmc.DynamicBayesNet:
-    """Gains of the wheels, and the pose; as many landmarks as the map has room for."""
-    dbn = bmc.DynamicBayesNet("slam", plates={"landmark": places})
-    dbn.input("motion", event_shape=(3,))
-    dbn.input("effort", event_shape=(3,))  # metres, radians, seconds since the slice before
+class _Way:
+    """What the wheels say of a way, added up: motion, how it moves with the gains, covariance, seconds."""
+
+    def __init__(self) -> None:
+        self.motion, self.bend, self.noise = np.zeros(3), np.zeros((3, 2)), np.zeros((3, 3))
+        self.seconds = 0.0
+
+    @property
+    def told(self) -> tuple[Any, ...]:
+        return self.motion, self.bend, self.noise, self.seconds
+
+    def drive(self, motion: np.ndarray, effort: np.ndarray) -> None:
+        """One more stretch: its motion as seen from its start, and the metres, radians and seconds of it."""
+        turn = turned(self.motion[2])
+        x, y, angle = turn @ motion
+        shift = np.eye(3)  # what stands before moves with the heading
+        shift[:2, 2] = -y, x
+        halfway = 0.5 * angle  # a gain of the turn bends the arc by half of it
+        gains = turn @ [
+            [motion[0], -halfway * motion[1]],
+            [motion[1], halfway * motion[0]],
+            [0, angle],
+        ]
+        place = PER_METRE * effort[0] + 1e-8
+        heading = PER_RADIAN * effort[1] + PER_SECOND * effort[2] + 1e-8
+        own = turn @ np.diag([place, place, heading]) @ turn.T
+        self.bend = shift @ self.bend + gains
+        self.noise = shift @ self.noise @ shift.T + own
+        self.motion = self.motion + [x, y, angle]
+        self.seconds += float(effort[2])
+
+
+def turned(heading: Any) -> np.ndarray:
+    """Rotations of (x, y, heading) by a heading, shape (..., 3, 3)."""
+    c, s = np.cos(heading), np.sin(heading)
+    zero, one = np.zeros_like(c), np.ones_like(c)
+    rows = [[c, -s, zero], [s, c, zero], [zero, zero, one]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def one_by_one(readings: Readings) -> Readings:
+    """The same with one reading in a slice; those of one instant follow each other without moving.
+
+    All bearings of an instant are off by something in common, how the camera points: the heading is told
+    anew in each of them.
+    """
+    heard = readings.which >= 0
+    heard[0, 0] = True  # where the drive starts is a slice also where nothing is read
+    rows, columns = np.nonzero(heard)
+    again = np.diff(rows, prepend=-1) == 0
+    still = 1e-8 * np.eye(3)
+    first = [np.where(again.reshape(-1, *[1] * (a.ndim - 1)), 0.0, a[rows]) for a in readings[1:5]]
+    first[2] += np.where(again[:, None, None], still, np.diag([0.0, 0.0, AIM**2]))
+    return Readings(
+        readings.times[rows],
+        *first,
+        readings.spin[rows],
+        readings.which[rows, columns],
+        readings.seen[rows, columns],
+        readings.truth[rows],
+    )
+
+
+def robot(start: np.ndarray, **plates: int) -> bmc.DynamicBayesNet:
+    """Gains of the wheels, and the pose."""
+    dbn = bmc.DynamicBayesNet("slam", plates=plates)
+    for name, shape in (("motion", (3,)), ("bend", (3, 2)), ("noise", (3, 3))):
+        dbn.input(name, event_shape=shape)
+    for name in ("seconds", "spin"):
+        dbn.input(name)
 
     @dbn.node(initial=bmc.MvNormal([1.0, 1.0], scale_diag=[SPREAD, SPREAD]))
-    def gain(gain_prev, effort):
-        kept = np.exp(-effort[..., 2:] / LASTING)
+    def gain(gain_prev, seconds):
+        kept = np.exp(-seconds / LASTING)[..., None]
         scale = SPREAD * np.sqrt(1 - kept**2 + 1e-9)
         return bmc.MvNormal(1 + kept * (gain_prev - 1), scale_diag=scale * np.ones(2))
 
     @dbn.node(initial=PoseNormal(start, scale_diag=[1e-3, 1e-3, 1e-3]))
-    def pose(pose_prev, gain, motion, effort):
-        metres, radians, seconds = effort[..., 0], effort[..., 1], effort[..., 2]
-        place = np.sqrt(PER_METRE * metres + 1e-8)
-        heading = np.sqrt(PER_RADIAN * radians + PER_SECOND * seconds + 1e-8)
-        driven = motion * gain[..., [0, 0, 1]]
-        return PoseNormal(
-            compose(pose_prev, driven), scale_diag=np.stack([place, place, heading], -1)
-        )
+    def pose(pose_prev, gain, motion, bend, noise):
+        turn = turned(pose_prev[..., 2])
+        driven = compose(pose_prev, motion + np.matvec(bend, gain - 1))
+        return PoseNormal(driven, cov=turn @ noise @ np.swapaxes(turn, -1, -2))
 
     return dbn
 
@@ -121,28 +205,44 @@ def with_marks(dbn: bmc.DynamicBayesNet, mean: Any, scale: float) -> bmc.Dynamic
     return dbn
 
 
-def known_net(start: np.ndarray, mean: Any, scale: float, places: int) -> bmc.DynamicBayesNet:
-    """Readings that say which landmark they are of, and a few of which this is not true.
+def by_camera(pose: Any, place: Any, spin: Any) -> tuple[np.ndarray, np.ndarray]:
+    """What a camera without noise reads of a landmark: how deep it stands, and where.
 
-    A camera tells ranges by how large a barcode looks, so what they are off by grows with them; ``reach`` is
-    the range that was read. A misread barcode is off by metres, and where no state stood for it a single one
-    would leave those particles that are most wrong.
+    It tells the distance by how large a barcode looks, which goes by the depth along the axis of the camera
+    and not by the range; MRCLAM 6 writes the depth. Its pictures are some 33 ms old.
     """
-    dbn = with_marks(robot(start, places), mean, scale)
-    dbn.input("which")
-    dbn.input("reach")
-    dbn.add("stray", bmc.Bernoulli(STRAY))
+    angle = bearing_to(pose, place)
+    deep = range_to(pose, place) * np.cos(angle)
+    return (1 + LONG) * deep + FAR, angle + LATE * spin
 
-    @dbn.node
-    def seen(pose, mark, which, reach, stray):
-        place, none = mark[which], stray == 1
-        far = np.where(none, ANYWHERE, range_to(pose, place))
-        angle = np.where(none, 0.0, bearing_to(pose, place))
-        wide = np.sqrt(RANGE**2 + (SHARE * reach) ** 2)
-        return AndAngle(
-            bmc.Normal(far, np.where(none, ANYWHERE_RANGE, wide)),
-            bmc.WrappedNormal(angle, np.where(none, ANYWHERE_BEARING, BEARING)),
-        )
+
+def read_or_stray(read: tuple[Any, Any], none: Any, depth: Any, bearing: Any) -> AndAngle:
+    """Density of a reading by the camera, or from anywhere (``none``)."""
+    far, angle = read
+    return AndAngle(
+        bmc.Normal(np.where(none, ANYWHERE, far), np.where(none, ANYWHERE_DEPTH, depth)),
+        bmc.WrappedNormal(np.where(none, 0.0, angle), np.where(none, ANYWHERE_BEARING, bearing)),
+    )
+
+
+def known_net(
+    start: np.ndarray, mean: Any, scale: float, places: int, most: int
+) -> bmc.DynamicBayesNet:
+    """Readings that say which landmark they are of, ``most`` in an instant; of a few this is not true.
+
+    Errors grow with the depth (``deep`` is what was read), since a camera tells it by size. A misread
+    barcode is off by metres, and where no state stood for it a single one would leave those particles that
+    are most wrong.
+    """
+    dbn = with_marks(robot(start, landmark=places, reading=most), mean, scale)
+    dbn.input("which", plates="reading")
+    dbn.input("deep", plates="reading")
+    dbn.add("stray", bmc.Bernoulli(STRAY), plates="reading")
+
+    @dbn.node(plates="reading")
+    def seen(pose, mark, which, deep, spin, stray):
+        wide = np.sqrt(DEPTH**2 + (SHARE * deep) ** 2)
+        return read_or_stray(by_camera(pose, mark[which], spin), stray == 1, wide, BEARING)
 
     return dbn
 
@@ -154,18 +254,10 @@ def unknown_net(start: np.ndarray, places: int = PLACES) -> bmc.DynamicBayesNet:
     ``places + 1`` (none: a reading from anywhere). That a reading is of a new one is the less likely the more
     readings there were, as in a Chinese restaurant process. Readings of one instant are of different
     landmarks: those that are ``taken`` are out, one bit for each.
-
-    Who picks by the size of what is off must know how errors come about: a range is off by a share of it that
-    lasts for seconds and is each landmark's own, so this share is carried with the landmark's place.
     """
-    dbn = with_marks(robot(start, places), np.zeros(2), HALL)
+    dbn = with_marks(robot(start, landmark=places), np.zeros(2), HALL)
     for name in ("heard", "count", "again"):  # read at all, readings before, of the same instant
         dbn.input(name)
-
-    @dbn.node(plates="landmark", initial=bmc.Normal(0.0, OFF))
-    def off(off_prev, effort):
-        kept = np.exp(-effort[..., 2] / LASTS)
-        return bmc.Normal(kept * off_prev, OFF * np.sqrt(1 - kept**2 + 1e-8))
 
     def shares(met, count, taken):
         met, count, taken = (np.asarray(a)[..., None] for a in (met, count, taken))
@@ -205,14 +297,9 @@ def unknown_net(start: np.ndarray, places: int = PLACES) -> bmc.DynamicBayesNet:
     )
 
     @dbn.node
-    def seen(pose, mark, off, number, which):
-        k, none = number.astype(int), which == places + 1
-        reach = np.where(none, ANYWHERE, range_to(pose, mark[k]) * (1 + off[k]))
-        angle = np.where(none, 0.0, bearing_to(pose, mark[k]))
-        return AndAngle(
-            bmc.Normal(reach, np.where(none, ANYWHERE_RANGE, FAST_RANGE)),
-            bmc.WrappedNormal(angle, np.where(none, ANYWHERE_BEARING, FAST_BEARING)),
-        )
+    def seen(pose, mark, number, which, spin):
+        read = by_camera(pose, mark[number.astype(int)], spin)
+        return read_or_stray(read, which == places + 1, FAST_DEPTH, FAST_BEARING)
 
     return dbn
 
@@ -220,11 +307,11 @@ def unknown_net(start: np.ndarray, places: int = PLACES) -> bmc.DynamicBayesNet:
 def first_places(readings: Readings, marks: int) -> np.ndarray:
     """Where dead reckoning puts each landmark's first reading, shape (marks, 2)."""
     pose, found = readings.truth[0], np.full((marks, 2), np.nan)
-    for motion, which, seen in zip(readings.motion, readings.which, readings.seen, strict=True):
+    for motion, own, seen in zip(readings.motion, readings.which, readings.seen, strict=True):
         pose = compose(pose, motion)
-        if which >= 0 and np.isnan(found[which, 0]):
-            angle = pose[2] + seen[1]
-            found[which] = pose[:2] + seen[0] * np.array([np.cos(angle), np.sin(angle)])
+        for k, (deep, angle) in zip(own, seen, strict=True):
+            if k >= 0 and np.isnan(found[k, 0]):
+                found[k] = transform(pose, [deep, deep * np.tan(angle)])
     return np.where(np.isnan(found), readings.truth[0, :2], found)
 
 
@@ -239,25 +326,25 @@ def with_labels(
     """Beliefs of any engine, given which landmarks are read, and where known what is misread (``stray``)."""
     marks = len(drive.marks)
     mean, scale = (first_places(readings, marks), GUESSED) if guessed else (np.zeros(2), VAGUE)
-    reach = np.where(readings.which >= 0, readings.seen[:, 0], 1.0)
-    inputs = {**readings.inputs, "which": np.maximum(readings.which, 0), "reach": reach}
+    deep = np.where(readings.which >= 0, readings.seen[..., 0], 1.0)
+    inputs = {**readings.inputs, "which": np.maximum(readings.which, 0), "deep": deep}
     rows = {"seen": readings.seen} | ({} if stray is None else {"stray": stray})
-    dbn = known_net(drive.start, mean, scale, marks)
+    dbn = known_net(drive.start, mean, scale, marks, readings.which.shape[1])
     return bmc.filter(dbn, rows, inputs=inputs, engine=engine, rng=seed)
 
 
 def ekf_slam(readings: Readings, drive: Drive, stray: np.ndarray | None = None) -> Any:
     """The same net under an extended Kalman filter, which has no states: it takes every barcode for right."""
     if stray is None:
-        stray = np.zeros(len(readings.times), dtype=int)
+        stray = np.zeros(readings.which.shape, dtype=int)
     return with_labels(readings, drive, bmc.ExtendedKalmanFilter(), guessed=True, stray=stray)
 
 
 def misread(readings: Readings, marks: np.ndarray) -> np.ndarray:
-    """Readings that by the truth are of another landmark than their barcode says, shape (T,), 0 or 1."""
-    own = marks[np.maximum(readings.which, 0)]
-    far = np.abs(readings.seen[:, 0] - range_to(readings.truth, own)) > 1.2
-    aside = np.abs(wrap(readings.seen[:, 1] - bearing_to(readings.truth, own))) > 0.2
+    """Readings that by the truth are of another landmark than their barcode says, shape (T, K), 0 or 1."""
+    deep, angle = by_camera(readings.truth[:, None], marks[np.maximum(readings.which, 0)], 0.0)
+    far = np.abs(readings.seen[..., 0] - deep) > 1.2
+    aside = np.abs(wrap(readings.seen[..., 1] - angle)) > 0.2
     return ((far | aside) & (readings.which >= 0)).astype(int)
 
 
@@ -265,12 +352,8 @@ def without_labels(readings: Readings, drive: Drive, engine: Any, seed: int = 0)
     """Beliefs where it is not known."""
     heard = readings.which >= 0
     again = (np.diff(readings.times, prepend=-1.0) == 0) & heard
-    inputs = {
-        **readings.inputs,
-        "heard": heard * 1,
-        "count": np.cumsum(heard) - heard,
-        "again": again * 1,
-    }
+    count = np.cumsum(heard) - heard
+    inputs = {**readings.inputs, "heard": heard * 1, "count": count, "again": again * 1}
     dbn, rows = unknown_net(drive.start), {"seen": readings.seen}
     return bmc.filter(dbn, rows, inputs=inputs, engine=engine, rng=seed, keep="particles")
 
@@ -328,9 +411,9 @@ def moved_onto(marks: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return one @ np.array([[c, s], [-s, c]]) + truth.mean(axis=0)
 
 
-def fast_slam(particles: int, *more: str) -> bmc.ParticleFilter:
+def fast_slam(particles: int) -> bmc.ParticleFilter:
     """FastSLAM 2.0; without ``proposal`` it is FastSLAM 1.0."""
-    return bmc.ParticleFilter(particles, marginalize=("mark", *more), proposal="optimal")
+    return bmc.ParticleFilter(particles, marginalize="mark", proposal="optimal")
 
 
 def figures(
@@ -339,7 +422,7 @@ def figures(
     """Errors in m of the robots of an MRCLAM folder where it is known which landmark is read, one by one."""
     for k in robots:
         drive = marks_seen(folder, k)
-        readings = one_by_one(drive)
+        readings = instants(drive)
         vague = with_labels(readings, drive, fast_slam(particles))
         same = with_labels(readings, drive, fast_slam(particles), guessed=True)
         kalman = ekf_slam(readings, drive)
@@ -365,8 +448,8 @@ def picks(
     """Shares of readings assigned right where it is not known, beside those of who knows pose and map."""
     for k in robots:
         drive = marks_seen(folder, k)
-        readings = one_by_one(drive)
-        found = without_labels(readings, drive, fast_slam(particles, "off"))
+        readings = one_by_one(instants(drive))
+        found = without_labels(readings, drive, fast_slam(particles))
         numbers = assigned(found)
         yield (
             k,
@@ -380,18 +463,17 @@ def picks(
 
 
 def ceilings(readings: Readings, marks: np.ndarray) -> dict[str, float]:
-    """Shares right of who knows every pose and the map, and looks at readings as independent.
+    """Shares right of who knows all poses and the map, and looks at readings, one in a slice, as independent.
 
-    The nearest landmark, by deviations of range and bearing; the same with each landmark once in an instant;
-    and with parabolas of the robot's own in range, fitted to what is off, taken away.
+    The nearest landmark, by deviations of depth and bearing; the same with each landmark once in an instant;
+    and with what is off by the robot's own camera, a line in the depth and one in the bearing, taken away.
     """
     from scipy.optimize import linear_sum_assignment
 
     known = np.flatnonzero((readings.which >= 0) & np.isfinite(readings.truth[:, 0]))
     pose, seen, which = readings.truth[known], readings.seen[known], readings.which[known]
-    off = seen[:, None, :] - np.stack(
-        [range_to(pose[:, None], marks), bearing_to(pose[:, None], marks)], axis=-1
-    )
+    read = np.stack(by_camera(pose[:, None], marks, readings.spin[known, None]), axis=-1)
+    off = seen[:, None, :] - read
     off[..., 1] = wrap(off[..., 1])
     _, instant = np.unique(readings.times[known], return_inverse=True)
 
@@ -402,17 +484,19 @@ def ceilings(readings: Readings, marks: np.ndarray) -> dict[str, float]:
             right += int((which[rows][own] == other).sum())
         return right / len(which)
 
-    cost = np.square(off / [NEAR_RANGE, NEAR_BEARING]).sum(axis=-1)
-    true = off[np.arange(len(which)), which]
-    powers, fitted = np.vander(seen[:, 0], 3), np.zeros_like(true)
-    for _ in range(3):  # without what is far off
-        usual = (np.abs(true - fitted) < 4 * np.array([NEAR_RANGE, NEAR_BEARING])).all(axis=-1)
-        fitted = powers @ np.linalg.lstsq(powers[usual], true[usual], rcond=None)[0]
-    mended = np.square((off - fitted[:, None]) / [NEAR_RANGE, NEAR_BEARING]).sum(axis=-1)
+    near = np.array([NEAR_DEPTH, NEAR_BEARING])
+    cost = np.square(off / near).sum(axis=-1)
+    own = np.arange(len(which)), which
+    usual = (np.abs(off[own]) < 8 * near).all(axis=-1)  # without what is far off
+    mended = off.copy()
+    for k in range(2):
+        lines = np.stack([np.ones_like(read[..., k]), read[..., k]], axis=-1)
+        slope = np.linalg.lstsq(lines[own][usual], off[own][usual, k], rcond=None)[0]
+        mended[..., k] -= lines @ slope
     return {
         "told all: nearest": float((cost.argmin(axis=1) == which).mean()),
         "each once": once(cost),
-        "and unbiased": once(mended),
+        "and unbiased": once(np.square(mended / near).sum(axis=-1)),
     }
 
 
@@ -453,18 +537,20 @@ def log(fast: bool) -> tuple[str, Drive]:
     if folder is not None and not fast:
         return "MRCLAM 6, robot 1", marks_seen(folder, 1)
     with tempfile.TemporaryDirectory() as made:
-        return "a generated drive", marks_seen(write_mrclam(Path(made), 60.0 if fast else 200.0), 1)
+        return "a generated drive", marks_seen(
+            write_mrclam(Path(made), 60.0 if fast else 200.0, depths=True), 1
+        )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print errors of maps and paths, and draw them."""
     options = picture.options(__doc__, arguments)
     name, drive = log(options.fast)
-    readings = one_by_one(drive, 25.0 if options.fast else np.inf)
+    readings = instants(drive, 25.0 if options.fast else np.inf)
     found = with_labels(readings, drive, fast_slam(20 if options.fast else 400))
     kalman = ekf_slam(readings, drive)
-    short = one_by_one(drive, 8.0 if options.fast else 150.0)
-    engine = fast_slam(10 if options.fast else 30, "off")
+    short = one_by_one(instants(drive, 8.0 if options.fast else 150.0))
+    engine = fast_slam(10 if options.fast else 30)
     numbers = assigned(without_labels(short, drive, engine))
     met = np.unique(readings.which[readings.which >= 0])
     print(f"Mapping while moving: {name}, {readings.times[-1]:.0f} s, {len(met)} landmarks met")
