@@ -164,23 +164,6 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
     except BayesmcError as error:
         if not node.links or node.declaration.source == "table" or _is_plain(error):
             raise
-<<<<<<< HEAD
-        try:
-            node.called(entry(node, model.probe, model.probe_shape))
-        except BayesmcError as alone:
-            raise alone from alone.__cause__
-        sizes = sizes_in(str(error.__cause__), model.probe_shape)
-        around = data_around(node.declaration, node.plate_shape, sizes)
-        around = around or _picked_by_row(model, node, str(error.__cause__))
-        if around is not None:
-            raise BroadcastError(f"node {node.name!r}: {around}") from error
-        instead = "np.exp for math.exp" if "Python scalars" in str(error) else "np.where for if"
-        raise BroadcastError(
-            f"node {node.name!r} works on one value at a time but not on arrays of them: "
-            f"{str(error).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
-            f"({instead}, axis=-1 for components), or declare vectorize=True (slow)"
-        ) from error
-=======
         whole = error
     alone = _fault_alone(model, node)  # outside, so that no error shows twice
     if alone is not None:
@@ -189,6 +172,7 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
         raise whole from whole.__cause__
     sizes = sizes_in(str(whole.__cause__), model.probe_shape)
     around = data_around(node.declaration, node.plate_shape, sizes)
+    around = around or _picked_by_row(model, node, str(whole.__cause__))
     if around is not None:
         raise BroadcastError(f"node {node.name!r}: {around}") from whole
     instead = "np.exp for math.exp" if "Python scalars" in str(whole) else "np.where for if"
@@ -206,7 +190,6 @@ def _fault_alone(model: Model, node: CompiledNode) -> BayesmcError | None:
     except BayesmcError as error:
         return error
     return None
->>>>>>> fix-series
 
 
 def _picked_by_row(model: Model, node: CompiledNode, message: str) -> str | None:
