@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Constant,
     Elementwise,
@@ -131,10 +132,16 @@ def _filled(node: Expression, args: tuple[Expression, ...]) -> Expression:
     return broadcast(real, shape)
 
 
+#: levels of an expression in which a term is looked for: recursions over time nest without end, and their
+#: sums have more terms at every level
+DEEPEST = 150
+
+
 class TermReader:
     """Reads an expression as a sum of terms with coefficients that are free of what it is read in.
 
     A subclass says what is free, what a term is, and what functions make of sums, element by element.
+    What is nested deeper than ``DEEPEST`` levels is refused, a `TraceError`.
     """
 
     #: the term of what is free
@@ -144,11 +151,18 @@ class TermReader:
 
     def __init__(self) -> None:
         self._found: dict[Expression, dict[Any, Expression]] = {}
+        self._level = 0
 
     def __call__(self, node: Expression) -> dict[Any, Expression]:
         found = self._found.get(node)
         if found is None:
-            found = self._found[node] = self._read(node)
+            if self._level >= DEEPEST:
+                raise TraceError("what is made of it is nested too deep to be read")
+            self._level += 1
+            try:
+                found = self._found[node] = self._read(node)
+            finally:
+                self._level -= 1
         return found
 
     def is_free(self, node: Expression) -> bool:

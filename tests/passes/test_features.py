@@ -104,3 +104,21 @@ def test_what_has_no_features_is_refused(name):
     density = log_density(trace(BENT[name], [x, s]), leaf("y", ()))
     with pytest.raises(TraceError):
         statistics(density, "x")
+
+
+def test_what_is_nested_without_end_is_refused():
+    """A recursion over time nests a level or more in every slice: refused, and no stack runs out."""
+
+    def density(steps):
+        def child(x, s):
+            mean = 0.0 * x
+            for y in np.linspace(-1.0, 1.0, steps):
+                mean = 0.2 + s * (y - mean)
+            return bmc.Normal(mean * x, 1.0)
+
+        family = trace(child, [TracedArray(leaf(n, ())) for n in "xs"])
+        return log_density(family, leaf("y", ()))
+
+    assert set(statistics(density(5), "x").coefficients) == {1.0, 2.0}
+    with pytest.raises(TraceError, match="nested too deep"):
+        statistics(density(400), "s")
