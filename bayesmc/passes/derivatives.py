@@ -131,7 +131,7 @@ def gradient(root: Expression, names: Iterable[str]) -> dict[str, Expression]:
                 continue
             part = _unbroadcast(part, operand.shape)
             adjoints[operand] = add(adjoints[operand], part) if operand in adjoints else part
-            if node in masked or (isinstance(node, Elementwise) and node.function is np.where):
+            if node in masked or _leaves_out(node):
                 masked.add(operand)
     return {
         n.name: broadcast(adjoints.get(n, ZERO), n.shape)
@@ -221,7 +221,7 @@ def _pushed(node: Expression, moved: list[Expression]) -> Expression:
         total = ZERO
         for slope, own in zip(slopes(node), moved, strict=True):
             if slope is not None and not is_all(own, 0):
-                total = add(total, multiply(own, slope))
+                total = add(total, _times(slope, own, _leaves_out(node)))
         return total
     full = [broadcast(m, a.shape) for m, a in zip(moved, node.operands, strict=True)]
     if isinstance(node, Pick):
@@ -230,7 +230,7 @@ def _pushed(node: Expression, moved: list[Expression]) -> Expression:
         return gather(full[0], node.rows)
     if isinstance(node, Reduction):
         part = _reduced_slopes(node)
-        inner = full[0] if part is None else multiply(part, full[0])
+        inner = full[0] if part is None else _times(part, full[0], _leaves_out(node))
         return reduction(np.add, inner, node.axes)
     assert isinstance(node, Call)
     return call_tangent(node, full)
@@ -262,6 +262,15 @@ def _pulled(
         return [wide if part is None else _times(wide, part, masked)]
     assert isinstance(node, Call)
     return call_adjoints(node, own)
+
+
+def _leaves_out(node: Expression) -> bool:
+    """Whether some operands count for nothing at some values: what is below need not be finite there.
+
+    A branch that is not taken; a term of a sum of exponentials that is impossible, minus infinity.
+    """
+    function = getattr(node, "function", None) or getattr(node, "ufunc", None)
+    return function in (np.where, np.logaddexp, np.logaddexp2)
 
 
 def _times(adjoint: Expression, slope: Expression, masked: bool) -> Expression:
@@ -297,7 +306,9 @@ def _reduced_slopes(node: Reduction) -> Expression | None:
     if node.ufunc is np.multiply:
         return excluded_products(operand, node.axes)
     if node.ufunc in (np.logaddexp,):
-        return elementwise(np.exp, elementwise(np.subtract, operand, whole))
+        share = elementwise(np.exp, elementwise(np.subtract, operand, whole))
+        nothing = elementwise(np.equal, whole, -np.inf)  # no term is possible
+        return tidy(np.where, nothing, ZERO, share)
     if node.ufunc in (np.maximum, np.minimum, np.fmax, np.fmin):
         top = tidy(np.where, elementwise(np.equal, operand, whole), ONE, ZERO)
         count = reshape(reduction(np.add, top, node.axes), kept)

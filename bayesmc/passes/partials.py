@@ -109,8 +109,9 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
         lambda a, b, y: np.true_divide(np.negative(a), np.square(np.hypot(a, b))),
     ),
     np.hypot: _both(lambda a, b, y: a / y),
-    np.logaddexp: _both(lambda a, b, y: np.exp(a - y)),
-    np.logaddexp2: _both(lambda a, b, y: np.exp2(a - y)),
+    # no share where neither is possible
+    np.logaddexp: _both(lambda a, b, y: np.where(np.equal(y, -np.inf), 0.0, np.exp(a - y))),
+    np.logaddexp2: _both(lambda a, b, y: np.where(np.equal(y, -np.inf), 0.0, np.exp2(a - y))),
     np.remainder: (
         lambda a, b, y: _kinked(1.0, _wraps(a, b, y)),
         lambda a, b, y: _kinked(-np.floor_divide(a, b), _wraps(a, b, y)),

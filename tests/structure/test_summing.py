@@ -305,3 +305,23 @@ def test_bounds_that_depend_on_what_is_summed_are_refused() -> None:
     net.add("y", lambda x: bmc.Normal(x, 1.0))
     with pytest.raises(UnsupportedError, match="bounds of a continuous node depend on it"):
         bmc.log_density(net, {"y": 0.5})
+
+
+@pytest.mark.parametrize("compiled", [False, None])
+def test_slopes_beside_impossible_components(compiled):
+    """Under one state of the label both components are impossible; the slope of the rest is kept."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("c", bmc.Normal(0.0, 1.0))
+    net.add("w", bmc.Beta(2.0, 2.0))
+    net.add("t", bmc.Bernoulli(0.6), plates="i")
+
+    @net.node(plates="i")
+    def x(c, t, w):
+        share = w * t
+        parts = [bmc.Binomial(18, logits=c), bmc.Binomial(18, 0.0)]
+        return bmc.Mixture(bmc.stack([share, 1 - share]), parts)
+
+    density = bmc.log_density(net, {"x": [0, 2, 5, 0]}, compiled=compiled)
+    u = np.array([0.6, -0.3])
+    wanted = [(density(u + e)[0] - density(u - e)[0]) / 2e-5 for e in 1e-5 * np.eye(2)]
+    np.testing.assert_allclose(density(u)[1], wanted, rtol=1e-6)
