@@ -853,7 +853,7 @@ def test_vectors_without_spread_are_summed_up_by_component() -> None:
     with pytest.raises(UnsupportedError, match=r"singular.*one component"):
         posterior.marginal("both")
     assert posterior.marginal("both", (1,)).distribution.mean == pytest.approx(2.5)
-    assert "x[0, 1]" in str(posterior.summary())
+    assert "x[0, 1]" in str(posterior.summary(["x"]))
 
 
 @pytest.mark.parametrize("unit", [1e-300, 1.0, 1e300])
