@@ -94,8 +94,8 @@ MUTANTS = [
     Mutant(
         "a Jacobian is missing: trajectories on free numbers",
         (Edit("bayesmc.structure.free_nodes:FreeNode.expressions",
-              "return self._with_seen(broadcast(value, (*self.lead, *self.node.event_shape))), volume",
-              "return self._with_seen(broadcast(value, (*self.lead, *self.node.event_shape))), "
+              "return self._with_seen(broadcast(value, (*self.lead, *self.event))), volume",
+              "return self._with_seen(broadcast(value, (*self.lead, *self.event))), "
               "constant(0.0)"),
          Edit("bayesmc.structure.unconstrained:unconstrained_density", "hold_against_model(", "0 or print(")),
         trajectories(0.8),
