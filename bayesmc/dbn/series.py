@@ -171,8 +171,9 @@ def read_series(
         for n, v in given.items()
         if n in template.static
     }
-    for name in observed:
-        warn_of_doubts(slices.later, name, observed[name])
+    for name, found in observed.items():
+        if found is not None and slices.later[name].angles is not None:
+            warn_of_doubts(slices.later, name, found)
     return slices, Series(
         count,
         {n: o for n, o in observed.items() if o is not None},

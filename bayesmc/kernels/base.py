@@ -93,6 +93,10 @@ class Kernel:
         """Its memory where somebody else has put its nodes elsewhere; what it knew of the old place goes."""
         return memory
 
+    def unsettled(self, memory: Memory) -> bool:
+        """Whether it has only just begun to learn anew, so that a warmup should not end yet."""
+        return False
+
     def end_warmup(self, memory: Memory) -> Memory:
         """Adaptation ends: what was learnt is frozen."""
         return memory

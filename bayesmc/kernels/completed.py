@@ -110,12 +110,6 @@ class Completed(Kernel):
         return value.reshape(len(value), self.blanket.size, *self.blanket.event_shape)
 
 
-def is_seen_in_part(blanket: Blanket) -> bool:
-    """Whether of some of a node's vectors only some components were seen."""
-    seen = blanket.target.seen(blanket.name)
-    return seen is not None and seen.parts is not None
-
-
 def completed_kernel(blanket: Blanket) -> Completed:
     """The kernel of a node whose vectors are seen in part.
 

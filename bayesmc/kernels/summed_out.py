@@ -40,11 +40,11 @@ class SummedOut(Hamiltonian):
     ) -> None:
         super().__init__(density, given, **options)
         self.names = (*density.names, *density.summed)
-        self._cards = {n: density.target.model[n].domain for n in density.summed}
+        self._domains = {n: density.target.model[n].domain for n in density.summed}
         self._states = StateDraws(density)
 
     def words(self, name: str) -> tuple[str, str]:
-        domain = self._cards.get(name)
+        domain = self._domains.get(name)
         if domain is None:
             return super().words(name)
         return "summed out", f"{domain.size} states, then drawn given all numbers"

@@ -1,4 +1,4 @@
-"""Evidence that is possible but hardly meant: angles in degrees, readings that a density doubts, nothing.
+"""Angles that are possible but hardly meant: those in degrees, readings that a density doubts.
 
 What is impossible is refused where evidence is read (``evidence``).
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -20,37 +19,18 @@ _FULL_TURN = 2 * math.pi * (1 + 1e-6)
 _MANY, _DEGREES = 0.25, 361.0
 
 
-def warn_of_doubts(model: Model, name: str, found: Observed | None) -> None:
-    """Look at what was observed of one node.
+def warn_of_doubts(model: Model, name: str, found: Observed) -> None:
+    """Look at what was observed of one node with angles.
 
     Warns
     -----
     EvidenceWarning
         It is possible, but looks like degrees, or as its density says (``doubt`` of a distribution).
     """
-    if found is None or model[name].angles is None:
-        return
     values = found.value if found.mask is None else found.value[found.mask]
     doubt = _doubt(model, name, values) or _degrees(model[name], values)
     if doubt is not None:
         warnings.warn(f"evidence on {name!r}: {doubt}", EvidenceWarning, stacklevel=2)
-
-
-def warn_of_nothing(observed: Mapping[str, Observed]) -> None:
-    """Look whether the evidence has any values at all.
-
-    Warns
-    -----
-    EvidenceWarning
-        All of it are empty arrays, so that plates have size 0.
-    """
-    if observed and not any(found.value.size for found in observed.values()):
-        warnings.warn(
-            f"evidence on {', '.join(map(repr, observed))} is empty (size 0): nothing is learned from it, "
-            "and the answer is the prior",
-            EvidenceWarning,
-            stacklevel=2,
-        )
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError
-from bayesmc.network.doubts import warn_of_doubts, warn_of_nothing
+from bayesmc.errors import EvidenceWarning, ModelError
+from bayesmc.network.doubts import warn_of_doubts
 from bayesmc.network.evidence import Observed, read_question
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.model import Model
@@ -54,7 +55,15 @@ def pose(
         raise ModelError(f"expected a BayesNet or a FactorGraph, not {type(net).__name__}")
     evidence, inputs = net.unframed(evidence, inputs)
     question = read_question(net, evidence, inputs)
-    for name, found in question[2].items():
-        warn_of_doubts(question[1], name, found)
-    warn_of_nothing(question[2])
+    _, model, observed, _ = question
+    for name, found in observed.items():
+        if model[name].angles is not None:
+            warn_of_doubts(model, name, found)
+    if observed and not any(found.value.size for found in observed.values()):
+        warnings.warn(
+            f"evidence on {', '.join(map(repr, observed))} is empty (size 0): nothing is learned from it, "
+            "and the answer is the prior",
+            EvidenceWarning,
+            stacklevel=2,
+        )
     return Problem(*question)

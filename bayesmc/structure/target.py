@@ -204,6 +204,11 @@ class Target:
         seen = self.seen(name)
         return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
 
+    def is_seen_in_part(self, name: str) -> bool:
+        """Whether of some of a chain node's vectors only some components were seen."""
+        seen = self.seen(name)
+        return seen is not None and seen.parts is not None
+
     def with_seen(self, name: str, value: np.ndarray) -> np.ndarray:
         """Values of a chain node with what was seen of it put in place."""
         seen = self.seen(name)

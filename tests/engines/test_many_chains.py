@@ -19,7 +19,7 @@ from bayesmc.engines.mcmc import chains as running
 from bayesmc.engines.mcmc import length, sweep
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import plan_of
-from bayesmc.engines.mcmc.rounds import Lengths
+from bayesmc.engines.mcmc.loop import Lengths
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import ConvergenceWarning, UnsupportedError
 from bayesmc.network import Problem

@@ -11,21 +11,13 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.errors import ConvergenceWarning
+from tests.learning.test_fit import walk
 
 
 def quietly(net: Any, data: Any, **options: Any) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         return bmc.fit(net, data, **options)
-
-
-def walk() -> bmc.DynamicBayesNet:
-    dbn = bmc.DynamicBayesNet()
-    dbn.add_static("q", bmc.HalfNormal(5.0))
-    dbn.add_static("r", bmc.HalfNormal(5.0))
-    dbn.add("x", lambda x_prev, q: bmc.Normal(x_prev, q), initial=bmc.Normal(0.0, 3.0))
-    dbn.add("y", lambda x, r: bmc.Normal(x, r))
-    return dbn
 
 
 def dense(y: np.ndarray, q: float, r: float) -> float:

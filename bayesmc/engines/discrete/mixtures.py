@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -116,7 +117,9 @@ class SliceMixtures:
             rows = answers.plan.rows(answers.run.series, start, stop)
             term = answers.plan.terms[self.name, rows.kind]
             axes = len(reader.cards(term))
-            (values,) = reader.over_rows(term, rows, _reading(self, points, what))
+            (values,) = reader.over_rows(
+                term, rows, partial(self._values, points=points, what=what)
+            )
             for element in range(reader.elements(self.name)):
                 weights = answers.run.joint(reader.scope(term, element), start, stop)
                 own = reader.at_element(values, self.node, axes, element, 1)
@@ -125,7 +128,7 @@ class SliceMixtures:
                     reader.put_element(part, self.node, element, way(weights, own))
         return [np.moveaxis(out, -1, 0) for out in found]
 
-    def component_values(self, term: Term, rows: Rows, points: np.ndarray, what: str) -> np.ndarray:
+    def _values(self, term: Term, rows: Rows, points: np.ndarray, what: str) -> tuple[np.ndarray]:
         """What each configuration says, shape ``(rows, *cards, *plates, points)``."""
         reader = self.answers.reader
         cards = len(reader.cards(term))
@@ -138,7 +141,7 @@ class SliceMixtures:
                 values = np.exp(result.log_prob(x))
             else:
                 values = result.cdf(x) if what == "cdf" else result.ppf(x)
-        return np.moveaxis(padded(np.asarray(values), 2 + cards + len(self.node.plates)), 0, -1)
+        return (np.moveaxis(padded(np.asarray(values), 2 + cards + len(self.node.plates)), 0, -1),)
 
 
 class _CountLaws:
@@ -182,13 +185,6 @@ class _CountLaws:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _reading(mixtures: SliceMixtures, points: np.ndarray, what: str) -> Any:
-    def read(term: Term, rows: Rows) -> tuple[Any, ...]:
-        return (mixtures.component_values(term, rows, points, what),)
-
-    return read
 
 
 def _average(weights: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -31,10 +31,9 @@ from bayesmc.engines.mcmc.groups import (
     state_of,
 )
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
-from bayesmc.engines.mcmc.loop import Kept, Loop, Sampler, State
+from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
 from bayesmc.engines.mcmc.question import difference
-from bayesmc.engines.mcmc.rounds import Lengths
 from bayesmc.engines.mcmc.saved import SavedChains, answer_so_far
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.unrolled import series_of

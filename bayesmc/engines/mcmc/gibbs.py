@@ -23,7 +23,7 @@ from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.accepted import Accepted, finite_kernel, number_kernel
 from bayesmc.kernels.base import ANYHOW, How, Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
-from bayesmc.kernels.completed import completed_kernel, is_seen_in_part
+from bayesmc.kernels.completed import completed_kernel
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.ensemble import BlockWalk
@@ -211,7 +211,7 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: H
     vectors = [
         b for b in vector_blocks(target, blankets, joined, debug) if governing(target, b, blankets)
     ]
-    in_part = [n for n, b in blankets.items() if is_seen_in_part(b)]
+    in_part = [n for n in blankets if target.is_seen_in_part(n)]
     blocks += vectors
     joined |= {n for b in vectors for n in b.names}
     forms = Forms(target)

@@ -22,7 +22,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.engines.mcmc.convergence import MAX_RHAT, by_chance
-from bayesmc.engines.mcmc.rounds import Lengths
+from bayesmc.engines.mcmc.loop import Lengths
 from bayesmc.engines.mcmc.screening import some_scalars, uncut
 from bayesmc.network import Model, Problem
 from bayesmc.results.relabelling import ordered, pivot_of, symmetries

@@ -6,17 +6,25 @@ A sampler moves all chains by one sweep; what a sweep does is not known here.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.rounds import Lengths
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Patience, Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
+
+#: draws of each chain from which on a run may be seen not to get to its effective size, and how many times
+#: what is announced one makes at most that would get there so
+_HOPELESS, _FURTHER = 500, 2
+#: the first sweep at which a warmup may end where that is judged; draws of each chain in the first round, at
+#: least, and how much longer a later round may make a run
+_END, _ROUND, _GROWTH = 100, 16, 3.0
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, which can be saved
 State = Mapping[str, Any]
@@ -36,9 +44,8 @@ class Sampler(Protocol):
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
     Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
     ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged,
-    ``unsettled(state)`` says whether it should not end yet, and
-    ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None, and
-    ``energies(state)`` the energy of each chain's last one.
+    ``unsettled(state)`` says whether it should not end yet, ``divergences(state)`` how many trajectories of
+    each chain diverged since the warmup, or None, ``energies(state)`` the energy of each chain's last one.
     ``superchains`` (0) is set before the start, where so many groups of chains are to start as one.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
@@ -68,6 +75,62 @@ class Sampler(Protocol):
     def acceptance(self, state: State) -> Mapping[str, np.ndarray]:
         """Block -> share of proposals accepted since the warmup, shape (chain,)."""
         ...
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """What a run makes.
+
+    Attributes
+    ----------
+    chains : int
+    warmup : int
+        Sweeps; at most, where there is a ``judge``.
+    draws : int
+        Of each chain; where there is an ``ess`` at most, or up to ``most`` where these will do.
+    superchains : int
+        Groups of consecutive chains that start as one; 0 where every chain starts by itself.
+    ess : float or None
+        Effective size after which nothing more is drawn.
+    judge : callable or None
+        Whether draws of a warmup, some nodes' stored values, tell nothing of their starts any more.
+    """
+
+    chains: int
+    warmup: int
+    draws: int
+    superchains: int = 0
+    ess: float | None = None
+    judge: Callable[[Mapping[str, np.ndarray]], bool] | None = None
+
+    @property
+    def most(self) -> int:
+        """Draws of each chain that a run makes that is nearly there after ``draws``."""
+        return self.draws if self.ess is None else _FURTHER * self.draws
+
+    def ends(self) -> Iterator[int]:
+        """Sweeps at which the warmup may end."""
+        end = _END
+        while self.judge is not None and end < self.warmup:
+            yield end
+            end *= 2
+        yield self.warmup
+
+    def first(self) -> int:
+        """Draws of each chain in the first round."""
+        if self.ess is None:
+            return self.draws
+        return min(max(math.ceil(self.ess / self.chains), _ROUND), self.draws)
+
+    def further(self, made: int, share: float) -> int:
+        """Draws of each chain in the next round, where those made are a share of what is wanted.
+
+        0 where even the most that a run makes would not do: whoever is nearly there goes on.
+        """
+        if made >= min(_HOPELESS, self.draws) and share * self.most < made:
+            return 0
+        needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
+        return min(max(math.ceil(needed) - made, made // 8, 1), self.most - made)
 
 
 class Begun(NamedTuple):
@@ -164,10 +227,8 @@ class Loop:
 
     def _may_end(self, state: State, window: Kept) -> bool:
         """Whether a warmup has forgotten its starts, and no kernel has just begun to learn anew."""
-        unsettled = getattr(self.sampler, "unsettled", None)
-        if unsettled is not None and unsettled(state):
-            return False
-        return self.lengths.judge(window.frozen())  # type: ignore[misc]
+        unsettled = getattr(self.sampler, "unsettled", lambda _: False)
+        return not unsettled(state) and self.lengths.judge(window.frozen())  # type: ignore[misc]
 
     def _started(self) -> State:
         try:

@@ -16,7 +16,6 @@ from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.engines.mcmc.uphill import uphill
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.kernels.base import Kernel
-from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.redrawn import renewals
 from bayesmc.network import Problem
 from bayesmc.network.forward import Pass, refuse_noiseless, refuse_parts, run
@@ -74,8 +73,7 @@ class SweepSampler:
 
     def unsettled(self, state: Mapping[str, Any]) -> bool:
         """Whether a kernel has only just begun to learn anew, so that a warmup should not end yet."""
-        pairs = zip(self.kernels, state["memory"], strict=True)
-        return any(k.unsettled(m) for k, m in pairs if isinstance(k, Hamiltonian))
+        return any(k.unsettled(m) for k, m in zip(self.kernels, state["memory"], strict=True))
 
     def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
         return self.completed(state["values"], state["chains"], rng)
