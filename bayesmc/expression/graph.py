@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from operator import is_
+from threading import Lock
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -164,10 +165,8 @@ def leaf(name: str, shape: Shape, dtype: Any = float, states: int | None = None)
     >>> elementwise(np.exp, x), elementwise(np.exp, x) is elementwise(np.exp, x)
     (<Elementwise exp (3,)>, True)
     """
-    made = _interned(Leaf, (), (name, states), shape, np.dtype(dtype))
-    made.name, made.states = name, states
-    made.leaves = frozenset((name,))
-    return made
+    own = {"name": name, "states": states, "leaves": frozenset((name,))}
+    return _interned(Leaf, (), (name, states), shape, np.dtype(dtype), **own)
 
 
 def constant(value: Any) -> Constant:
@@ -176,9 +175,7 @@ def constant(value: Any) -> Constant:
     dtype = _standard(array.dtype)
     array = np.array(array, dtype)  # its own, in C order
     array.flags.writeable = False
-    made = _interned(Constant, (), _content(array), array.shape, dtype)
-    made.value = array
-    return made
+    return _interned(Constant, (), _content(array), array.shape, dtype, value=array)
 
 
 def elementwise(function: Any, *operands: Any) -> Expression:
@@ -193,9 +190,7 @@ def elementwise(function: Any, *operands: Any) -> Expression:
     if all(isinstance(a, Constant) for a in args) and math.prod(shape) <= _FOLDED:
         with np.errstate(all="ignore"):
             return constant(function(*(a.value for a in args)))  # type: ignore[attr-defined]
-    made = _interned(Elementwise, args, (function,), shape, dtype)
-    made.function = function
-    return made
+    return _interned(Elementwise, args, (function,), shape, dtype, function=function)
 
 
 def as_float(x: Any) -> np.ndarray:
@@ -250,11 +245,9 @@ def pick(operands: Sequence[Any], positions: Any) -> Expression:
     if len(inner) == len(args):  # parts of one array, put together again
         return pick(inner[0].operands, np.concatenate([a.positions.reshape(-1) for a in inner])[at])
     dtype = _standard(np.result_type(*(a.dtype for a in args)))
-    made = _interned(Pick, args, _content(at), at.shape, dtype)
-    if not hasattr(made, "positions"):
-        made.positions = np.array(at, order="C")
-        made.positions.flags.writeable = False
-    return made
+    at = np.array(at, order="C")
+    at.flags.writeable = False
+    return _interned(Pick, args, _content(at), at.shape, dtype, positions=at)
 
 
 def reshape(value: Any, shape: Shape) -> Expression:
@@ -305,9 +298,7 @@ def reduction(ufunc: np.ufunc, operand: Any, axes: Sequence[int]) -> Expression:
         with np.errstate(all="ignore"):
             return constant(ufunc.reduce(arg.value, axis=along))
     dtype = _standard(ufunc.reduce(np.ones(1, arg.dtype)).dtype)
-    made = _interned(Reduction, (arg,), (ufunc, along), shape, dtype)
-    made.ufunc, made.axes = ufunc, along
-    return made
+    return _interned(Reduction, (arg,), (ufunc, along), shape, dtype, ufunc=ufunc, axes=along)
 
 
 def call(
@@ -332,9 +323,8 @@ def call(
         if all(isinstance(a, Constant) for a in args):
             return constant(tried)
         shape, dtype = tried.shape, tried.dtype
-    made = _interned(Call, args, (function,), shape, _standard(np.dtype(dtype)))
-    made.call = function
-    return made
+    standard = _standard(np.dtype(dtype))
+    return _interned(Call, args, (function,), shape, standard, call=function)
 
 
 def as_expression(value: Any) -> Expression:
@@ -387,19 +377,30 @@ def sample(arg: Expression) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 _TABLE: WeakValueDictionary[tuple, Expression] = WeakValueDictionary()
+_ONE_AT_A_TIME = Lock()
 
 
 def _interned(
-    kind: Any, operands: tuple[Expression, ...], what: tuple, shape: Shape, dtype: np.dtype
+    kind: Any,
+    operands: tuple[Expression, ...],
+    what: tuple,
+    shape: Shape,
+    dtype: np.dtype,
+    **own: Any,
 ) -> Any:
-    """The one object for an expression."""
+    """The one object for an expression: whole before another thread can meet it, and one for all threads."""
     key = (kind, operands, what, shape, dtype)
     found = _TABLE.get(key)
     if found is None:
-        found = kind.__new__(kind)
-        found.operands, found.shape, found.dtype = operands, shape, dtype
-        found.leaves, found.content = _union(operands), what
-        _TABLE[key] = found
+        made = kind.__new__(kind)
+        made.operands, made.shape, made.dtype = operands, shape, dtype
+        made.leaves, made.content = _union(operands), what
+        for name, value in own.items():
+            setattr(made, name, value)
+        with _ONE_AT_A_TIME:
+            found = _TABLE.get(key)
+            if found is None:
+                found = _TABLE[key] = made
     return found
 
 
