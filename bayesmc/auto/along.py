@@ -15,7 +15,6 @@ from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, Plan
 from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
 from bayesmc.engines.mcmc.jointly import CROWD, continuous, density_of, summed_with
-from bayesmc.expression import ordered
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.factor_slice import FactorSlice
@@ -32,8 +31,6 @@ _LARGEST = 4096
 #: joint states of the labels of an element that are summed over, at most
 _STATES = 16
 _ACCEPTED = 0.9
-#: nodes of an expression beyond which its arithmetic is slow in NumPy
-_LONG = 300
 
 
 def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCarlo, str] | None:
@@ -88,16 +85,11 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
 
 
 def follows(problem: Problem, kernels: Sequence[Kernel]) -> bool:
-    """Whether one kernel moves all numbers along trajectories, in machine code.
-
-    Not so of recursions written out: other kernels beside it evaluate them in NumPy, node by node.
-    """
+    """Whether one kernel moves all numbers along trajectories, in machine code."""
     if len(kernels) != 1 or not isinstance(kernels[0], Hamiltonian):
         return False
     density = kernels[0].density
-    if not isinstance(density, UnconstrainedDensity) or len(ordered(density.root)) > _LONG:
-        return False
-    return _is_compiled(problem, density, Gibbs())
+    return isinstance(density, UnconstrainedDensity) and _is_compiled(problem, density, Gibbs())
 
 
 # ---- private ------------------------------------------------------------------------------------

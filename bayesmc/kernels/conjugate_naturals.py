@@ -65,6 +65,7 @@ from bayesmc.passes.features import LOG, LOG1M, Feature, statistics
 from bayesmc.passes.log_density import log_density
 from bayesmc.passes.reads import same_along
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.recursion import is_recursion
 from bayesmc.structure.target import Term
 
 #: parameters of vectors -> how a node must enter them
@@ -141,6 +142,9 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: Prior) -> F
     """Of numbers, by the features of prior and children."""
     if blanket.event_shape:
         return f"a {prior.words} prior has no conjugate pair"
+    terms = [t.expression for t in blanket.target.terms_of((blanket.name,))]
+    if is_recursion([e for e in terms if e is not None], blanket.name):
+        return "terms of its children are made of each other, and would be long if each were written out"
     of = moving(blanket, members)
     try:
         own = own_features(blanket, prior, of)

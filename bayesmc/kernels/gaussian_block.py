@@ -28,6 +28,7 @@ from bayesmc.kernels.gaussian_layout import BlockSums, Components, Layout
 from bayesmc.kernels.gaussian_rows import NormalRows
 from bayesmc.kernels.gaussian_terms import NormalTerms
 from bayesmc.linalg.patterns import cholesky, lapack, triangular
+from bayesmc.structure.recursion import is_recursion
 from bayesmc.structure.target import Target, Values
 
 #: components that one dense matrix may have, and how far from the diagonal a band may reach
@@ -312,7 +313,10 @@ def _is_able(normal: NormalTerms, name: str) -> bool:
     """Whether a node is Normal with a Gaussian full conditional."""
     if normal.target.model[name].is_discrete or not normal.is_prior(name):
         return False
-    found = [normal.of(t.name) for t in normal.target.terms_of((name,))]
+    terms = normal.target.terms_of((name,))
+    if is_recursion([t.expression for t in terms if t.expression is not None], name):
+        return False
+    found = [normal.of(t.name) for t in terms]
     return all(f is not None and normal.are_joint(f, (name,)) for f in found)
 
 

@@ -310,7 +310,10 @@ def _climbed(
 
     u, history, steps, label = start, [height], 0, bar.label
 
+    step_to = getattr(objective, "step_to", lambda _: None)
+
     def note(at: np.ndarray) -> None:
+        step_to(at)
         history.append(objective.value(at))
         bar.tell(f"{label}, at {history[-1]:.4f}")
         bar.advance()

@@ -21,14 +21,18 @@ from bayesmc.learning.unknowns import Unknowns
 _REMEMBERED = 8
 #: rows beyond which points are no longer next to free, so that slopes are only asked where they are wanted
 _LONG = 2000
+#: mass of a slice that a grid found for one point may lose besides at another, or have too much
+_OFF = 1e-3
+#: cells that a trial may always take, and how many times more than the last step took
+_CELLS, _FINER = 512, 8
 
 
 class SeriesEvidence(Evidence):
     """What a filter says of a series, given static nodes.
 
     A point and those around it, whose differences are the slope there, are asked in one pass where the filter
-    can. A grid that is found for one point is kept for those near it: finding one takes most of the time, and
-    grids that change from point to point make differences rough.
+    can. A grid that is found for one point is kept for those near it, as long as it fits: finding one takes
+    most of the time, and grids that change from point to point make differences rough.
     """
 
     def __init__(
@@ -43,6 +47,8 @@ class SeriesEvidence(Evidence):
         super().__init__(unknowns, self._log_evidence, with_prior)
         self.engine, self.dbn, self.data, self.inputs = engine, dbn, data, inputs
         self._grid: Any = None
+        self._off: float | None = None
+        self._is_of_trial = False
         self._together: SeveralPoints | None = None
         self._known: dict[bytes, tuple[float, np.ndarray | None]] = {}
         #: whether something is found anew for points that lie far from each other
@@ -79,7 +85,8 @@ class SeriesEvidence(Evidence):
         """Keep for points near ``u`` what is found there; False where nothing is, and nothing changes."""
         if not isinstance(self.engine, GridFilter):
             return False
-        self._grid = None  # so that this point's is sought
+        self._grid = self._off = None  # so that this point's is sought
+        self._is_of_trial = False
         self._known.clear()
         try:
             with np.errstate(all="ignore"):
@@ -87,6 +94,11 @@ class SeriesEvidence(Evidence):
         except BayesmcError as error:
             self.refused = error
         return self._grid is not None
+
+    def step_to(self, u: np.ndarray) -> None:
+        """Told of every step that is taken: a grid that a trial further off needed may be too fine here."""
+        if self._is_of_trial:
+            self.settle(u)
 
     # ---- private ------------------------------------------------------------------------------
 
@@ -137,15 +149,39 @@ class SeriesEvidence(Evidence):
 
     def _log_evidence(self, values: Mapping[str, np.ndarray]) -> float:
         asked = self._posed(values)
+        found, off = self._filtered(asked)
+        if self._grid is None or not isinstance(self.engine, GridFilter):
+            return found
+        if self._off is None:  # at the point that it was found for, or next to it
+            self._off = off
+        elif (
+            off > 2 * self._off + _OFF
+        ):  # too coarse here, or too narrow: densities add up to nothing true
+            asked = self._posed(values)
+            other = self.engine.grid_for(asked)
+            if other is not None and other.axis.size > max(_CELLS, _FINER * self._grid.axis.size):
+                raise UnsupportedError(
+                    f"GridFilter takes {other.described} for {other.name!r}, which no step is worth"
+                )
+            self._known.clear()
+            self._grid, self._off = other, None
+            found, self._off = self._filtered(asked)
+            self._is_of_trial = True
+        return found
+
+    def _filtered(self, asked: SeriesProblem) -> tuple[float, float]:
+        """The log evidence, and how much mass a grid lost, or had too much."""
         asked.cache[UNCOMPARED] = True
         if self._grid is not None and isinstance(self.engine, GridFilter):
             self.engine.taking(asked, self._grid)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # at parameters that do not fit, filters say so
+            if isinstance(self.engine, GridFilter):
+                return self.engine.log_evidence(asked)
             found = self.engine.filter(
                 asked, np.random.SeedSequence(0), progress=False
             ).log_marginal_likelihood
-        return float(np.sum(found))
+        return float(np.sum(found)), 0.0
 
 
 def of_template(

@@ -33,7 +33,7 @@ from bayesmc.shapes import Shape
 #: elements up to which an array is written out element by element
 FEW = 8
 #: elements written out, and bytes kept for one entry, beyond which nothing is compiled
-_WRITTEN, _KEPT = 8000, 1 << 26
+_WRITTEN, _KEPT = 20_000, 1 << 26
 
 #: ufuncs that reduce -> what they begin with
 STARTS: dict[Any, float] = {

@@ -23,7 +23,7 @@ from bayesmc.passes.arithmetic import add
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.element_sums import own_elements, sums_by_element
-from bayesmc.structure.free_terms import elements
+from bayesmc.structure.free_terms import elements_of
 from bayesmc.structure.target import Term, Values
 
 #: terms up to which it pays: more are evaluated together where they are alike
@@ -81,7 +81,7 @@ class Conditional:
         model, known = blanket.target.model, blanket.target.known
         read = {n for t in self.terms for n in t.scope} & known.keys() if reads_data else set()
         above = {n: stored_leaf(model, model[n]) for n in read}
-        logs = [elements(blanket.target, term, above) for term in self.terms]
+        logs = [log.anywhere for log in elements_of(blanket.target, self.terms, above)]
         #: log full conditionals of all elements, shape the node's plates
         self.root = _sum(blanket, self.terms, logs)
         parts = standing(self.root, self.name)

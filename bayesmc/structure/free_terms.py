@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,19 +13,29 @@ from bayesmc.expression import (
     Elementwise,
     Expression,
     Family,
+    Leaf,
     broadcast,
     expressions_of,
     mapped,
     ordered,
     pick,
 )
-from bayesmc.expression.graph import cast, substituted
+from bayesmc.expression.graph import cast
 from bayesmc.network.expressions import NodeCall, Opaque, density, log_density_of, stored_leaf
-from bayesmc.passes.arithmetic import is_all, tidy
+from bayesmc.passes.arithmetic import is_all, rewritten, tidy
 from bayesmc.passes.log_density import has_own_form
 from bayesmc.passes.logarithms import stable
 from bayesmc.passes.ranges import in_range
 from bayesmc.structure.target import Target, Term
+
+
+def put_in(roots: Sequence[Expression], given: Mapping[str, Expression]) -> list[Expression]:
+    """Expressions with others in place of leaves, by name."""
+
+    def change(node: Expression, _: list[Expression]) -> Expression | None:
+        return given.get(node.name) if isinstance(node, Leaf) else None
+
+    return rewritten(roots, change)
 
 
 def known_values(target: Target, expressions: Iterable[Expression]) -> dict[str, Expression]:
@@ -37,36 +48,69 @@ def known_values(target: Target, expressions: Iterable[Expression]) -> dict[str,
     return found
 
 
-def elements(
-    target: Target, term: Term, above: Mapping[str, Expression], is_inside: bool = False
-) -> Expression:
+def elements(target: Target, term: Term, above: Mapping[str, Expression]) -> Expression:
     """The log factors of a term that count, one after the other.
-
-    Parameters
-    ----------
-    is_inside : bool
-        Whether its node is inside of its support, wherever the free numbers are.
 
     Raises
     ------
     UnsupportedError
     """
-    whole = term.expression
-    if whole is None:
-        raise UnsupportedError(_why_not(term))
-    _refuse_opaque(term, whole, above)
-    given = {**known_values(target, [whole, *expressions_of(term.read.result)]), **above}  # type: ignore[union-attr]
-    log = broadcast(substituted(whole, given), term.shape)
-    if not term.is_potential:
-        family = term.read.result  # type: ignore[union-attr]
-        if is_inside and not (isinstance(family, Family) and has_own_form(family)):
-            log = _of_support(log)
-        condition = in_range(mapped(family, lambda e: stable([substituted(e, given)])[0]))
-        log = broadcast(tidy(np.where, condition, log, -np.inf), term.shape)
-    return pick([log], np.arange(log.size) if term.mask is None else np.flatnonzero(term.mask))
+    return elements_of(target, [term], above)[0].anywhere
+
+
+class Elements(NamedTuple):
+    """The log factors of a term that count, one after the other.
+
+    Attributes
+    ----------
+    anywhere, inside : Expression
+        For all values of its node, and for those inside of its support.
+    """
+
+    anywhere: Expression
+    inside: Expression
+
+
+def elements_of(
+    target: Target, terms: Sequence[Term], above: Mapping[str, Expression]
+) -> list[Elements]:
+    """The log factors of several terms: what these share, as those of a recursion do, is read once.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    wholes = [_expression(term) for term in terms]
+    if any(isinstance(n, Call) and isinstance(n.call, NodeCall) for n in ordered(*wholes)):
+        for term, whole in zip(terms, wholes, strict=True):
+            _refuse_opaque(term, whole, above)
+    families = [None if t.is_potential else t.read.result for t in terms]  # type: ignore[union-attr]
+    parameters = [list(expressions_of(f)) for f in families]
+    every = [*wholes, *(e for own in parameters for e in own)]
+    given = {**known_values(target, every), **above}
+    logs = put_in(wholes, given)
+    put = iter(stable(put_in([e for own in parameters for e in own], given)))
+    found = []
+    for term, family, log in zip(terms, families, logs, strict=True):
+        log = broadcast(log, term.shape)
+        both = [log, log]
+        if not term.is_potential:
+            if not (isinstance(family, Family) and has_own_form(family)):
+                both[1] = _of_support(log)
+            condition = in_range(mapped(family, lambda _: next(put)))
+            both = [broadcast(tidy(np.where, condition, e, -np.inf), term.shape) for e in both]
+        count = np.arange(log.size) if term.mask is None else np.flatnonzero(term.mask)
+        found.append(Elements(*(pick([e], count) for e in both)))
+    return found
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _expression(term: Term) -> Expression:
+    if term.expression is None:
+        raise UnsupportedError(_why_not(term))
+    return term.expression
 
 
 def _why_not(term: Term) -> str:

@@ -300,7 +300,7 @@ class LinkSteps:
         also: Callable[[str], Hashable] | None = None,
     ) -> None:
         self.target = target
-        self.steps: tuple[str | LikeLinks, ...] = tuple(_steps(target, links, also))
+        self.steps: tuple[Any, ...] = tuple(_steps(target, links, also))
 
     def compute(self, values: Values) -> None:
         """Put the links' values, given all others, in place."""

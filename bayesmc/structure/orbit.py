@@ -14,7 +14,7 @@ from bayesmc.expression.graph import substituted
 from bayesmc.network.expressions import stored_leaf
 from bayesmc.passes.alike import sums_of
 from bayesmc.passes.arithmetic import add
-from bayesmc.structure.free_terms import elements, known_values
+from bayesmc.structure.free_terms import elements_of, known_values
 from bayesmc.structure.programs import family_read
 from bayesmc.structure.target import Target
 
@@ -67,7 +67,7 @@ class Orbit:
             away = elementwise(np.subtract, now, centre)
             moved[other] = add(centre, broadcast(_times(away, factor), now.shape))
         terms = target.terms_of((name, *below))
-        logs = [elements(target, term, moved) for term in terms]
+        logs = [log.anywhere for log in elements_of(target, terms, moved)]
         numbers = sum(math.prod(model[n].value_shape) for n in below)
         total = _times(step, float(power + numbers))
         for part in sums_of(logs):

@@ -23,7 +23,8 @@ from bayesmc.network.expressions import Followed, Opaque, density, log_density_o
 from bayesmc.network.model import invalid_error, potential_shape
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
-from bayesmc.structure.like_functions import FEWEST, LinkSteps, Signatures, StackedFunction, Values
+from bayesmc.structure.like_functions import FEWEST, Signatures, StackedFunction, Values
+from bayesmc.structure.recursion import LinkPlan
 
 #: rows of the states on which functions are compared
 _STATES = 6
@@ -99,9 +100,8 @@ class Term:
         try:
             return self.log_of(dist, batch, values[self.name])
         except DensityError as error:
-            raise DensityError(
-                f"{error}{self.shown_at(values, error.index)}", error.index
-            ) from error
+            shown = f"{error}{self.shown_at(values, error.index)}"
+            raise DensityError(shown, error.index) from error
 
     def shown_at(self, values: Mapping[str, np.ndarray], index: Shape) -> str:
         """The values of the node and its parents at a place of its batch and plates, in words."""
@@ -232,7 +232,7 @@ class Target:
         return tuple(sorted(found, key=self._order.__getitem__))
 
     @cached_property
-    def _link_steps(self) -> dict[tuple[str, ...], LinkSteps]:
+    def _link_steps(self) -> dict[tuple[str, ...], LinkPlan]:
         """How some deterministic nodes are recomputed."""
         return {}
 
@@ -288,7 +288,7 @@ class Target:
             return
         steps = self._link_steps.get(links)
         if steps is None:
-            steps = self._link_steps[links] = LinkSteps(self, links)
+            steps = self._link_steps[links] = LinkPlan(self, links)
         steps.compute(values)
 
     @cached_property

@@ -27,7 +27,6 @@ from bayesmc.expression import (
     pick,
     reduction,
 )
-from bayesmc.expression.graph import substituted
 from bayesmc.passes.alike import sums_of
 from bayesmc.passes.arithmetic import ZERO, add, multiply
 from bayesmc.passes.derivatives import gradient
@@ -35,7 +34,7 @@ from bayesmc.passes.guarded import guarded
 from bayesmc.passes.logarithms import stable
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.free_nodes import FreeNode, free_node
-from bayesmc.structure.free_terms import elements, known_values
+from bayesmc.structure.free_terms import elements_of, known_values, put_in
 from bayesmc.structure.summing import sum_out
 from bayesmc.structure.target import Target, Term
 from bayesmc.structure.unconstrained_check import hold_against_model
@@ -90,11 +89,11 @@ def unconstrained_density(
     for node in nodes:
         given = {**known_values(target, node.bounds), **above}
         above[node.name], volumes[node.name] = node.expressions(parts[node.name], given)
-    plain = [elements(target, term, above) for term in terms]
+    logs = elements_of(target, terms, above)
+    plain = [log.anywhere for log in logs]
     whole = {n.name for n in nodes if n.elements is None}
     used = [
-        elements(target, t, above, True) if t.name in whole else e
-        for t, e in zip(terms, plain, strict=True)
+        log.inside if t.name in whole else log.anywhere for t, log in zip(terms, logs, strict=True)
     ]
     used = stable([*used, *volumes.values()])
     tables = sum_out(target, terms, finite, above)
@@ -108,19 +107,13 @@ def unconstrained_density(
         )
     once = _on_one_leaf(nodes, parts)
     slopes = _slopes(root, list(zip(terms, used, strict=False)), list(parts.values()), once)
-    tables = [table.mapped(lambda e: once(guarded([e])[0])) for table in tables]
-    volume = once(_total(used[len(terms) :]))
+    tables = [table.mapped(lambda e: once(guarded([e]))[0]) for table in tables]
+    volume, root = once([_total(used[len(terms) :]), root])
     density = UnconstrainedDensity(
-        target, nodes, once(root), slopes, tuple(finite), volume, tuple(tables)
+        target, nodes, root, slopes, tuple(finite), volume, tuple(tables)
     )
-    plain = [once(e) for e in guarded([*plain, *volumes.values()])]
-    hold_against_model(
-        density,
-        terms,
-        plain,
-        [once(e) for e in guarded(used)],
-        tables,
-    )
+    plain = once(guarded([*plain, *volumes.values()]))
+    hold_against_model(density, terms, plain, once(guarded(used)), tables)
     return density
 
 
@@ -170,7 +163,7 @@ def _slopes(
     root: Expression,
     used: Sequence[tuple[Term, Expression]],
     parts: Sequence[Leaf],
-    once: Callable[[Expression], Expression],
+    once: Callable[[Sequence[Expression]], list[Expression]],
 ) -> Expression:
     """The derivatives by all free numbers, one after the other.
 
@@ -181,7 +174,7 @@ def _slopes(
     names = [part.name for part in parts]
     try:
         if len(parts) > _FEW:  # what reads many nodes reads one array
-            return stable([gradient(once(root), [FREE])[FREE]])[0]
+            return stable([gradient(once([root])[0], [FREE])[FREE]])[0]
         found = gradient(root, names)
     except TraceError as error:
         for term, log in used:
@@ -192,15 +185,15 @@ def _slopes(
                 raise UnsupportedError(f"{kind} {term.name!r}: {own}") from own
         raise UnsupportedError(str(error)) from error
     each = [found.get(p.name, broadcast(ZERO, p.shape)) for p in parts]
-    return once(pick(stable(each), np.arange(sum(p.size for p in parts))))
+    return once([pick(stable(each), np.arange(sum(p.size for p in parts)))])[0]
 
 
 def _on_one_leaf(
     nodes: Sequence[FreeNode], parts: Mapping[str, Leaf]
-) -> Callable[[Expression], Expression]:
+) -> Callable[[Sequence[Expression]], list[Expression]]:
     """Puts parts of one array in place of the free numbers of each node."""
     whole = leaf(FREE, (sum(n.size for n in nodes),))
     places = {
         parts[n.name].name: pick([whole], n.start + np.arange(n.size)) for n in nodes if n.size
     }
-    return lambda root: substituted(root, places)
+    return lambda roots: put_in(roots, places)

@@ -16,6 +16,7 @@ from bayesmc.network import pose
 from bayesmc.structure import conditional
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.conditional import Conditional, conditional_of
+from bayesmc.structure.free_terms import Elements
 from bayesmc.structure.target import Target, target_of
 
 DATA = np.random.default_rng(3).normal(size=(4, 6))
@@ -93,17 +94,19 @@ def test_it_says_what_the_functions_say(model: Any, name: str) -> None:
 
 @pytest.mark.parametrize("fault", ["twice", "moved", "unmasked"])
 def test_what_differs_is_not_used(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    honest = conditional.elements
+    honest = conditional.elements_of
 
-    def wrong(target: Target, term: Any, above: Any) -> Any:
-        if fault == "unmasked":
-            term = replace(term, mask=None)
-        log = honest(target, term, above)
+    def of_one(log: Any) -> Any:
         if fault == "twice":
             return elementwise(np.multiply, log, 2.0)
         return elementwise(np.add, log, leaf("slope", ())) if fault == "moved" else log
 
-    monkeypatch.setattr(conditional, "elements", wrong)
+    def wrong(target: Target, terms: Any, above: Any) -> Any:
+        if fault == "unmasked":
+            terms = [replace(term, mask=None) for term in terms]
+        return [Elements(*map(of_one, found)) for found in honest(target, terms, above)]
+
+    monkeypatch.setattr(conditional, "elements_of", wrong)
     blanket = Blanket(target_of(pose(*partly_seen())), "slope")
     with pytest.raises(UnsupportedError, match="differs"):
         Conditional(blanket)

@@ -11,9 +11,13 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import BayesmcError
+from bayesmc.kernels.conjugate import conjugate_kernel
 from bayesmc.network import pose
+from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_functions import LikeLinks, LinkSteps, Slots
+from bayesmc.structure.recursion import LinkPlan, Recursion
 from bayesmc.structure.target import Target, Values, target_of
 from tests.structure.test_stacked import CHAINS, DATA, a_state
 
@@ -222,3 +226,60 @@ def test_an_error_names_the_node_at_fault() -> None:
 def test_links_below_a_node() -> None:
     target, _ = posed(slices)
     assert target.below(("x[2]",)) == ("m[2]", "n[2]")
+
+
+def averages(steps: int, factor: float = 1.0) -> tuple[Any, dict[str, Any]]:
+    """A moving average: each expected value is made of the one before."""
+    dbn = bmc.DynamicBayesNet("averages")
+    dbn.add_static("level", bmc.Normal(0.0, 1.0))
+    dbn.add_static("share", bmc.Normal(0.0, 0.5))
+    dbn.add_static("sd", bmc.HalfNormal(1.0))
+    dbn.add(
+        "mean",
+        lambda y_prev, mean_prev, level, share: level + factor * share * (y_prev - mean_prev),
+        initial=lambda level: level + 0.0,
+    )
+    dbn.add("y", lambda mean, sd: bmc.Normal(mean, sd))
+    return dbn, {"y": DATA.normal(size=steps)}
+
+
+def test_a_recursion_is_one_program() -> None:
+    dbn, data = averages(30)
+    target = target_of(pose_any(dbn, data, None))
+    plan = LinkPlan(target, target.links)
+    (step,) = [s for s in plan.steps if isinstance(s, Recursion)]
+    assert len(step.names) >= 28
+    for seed in (0, 1):  # the first call is that of the functions themselves
+        values = a_state(target, seed)
+        found = {n: v for n, v in values.items() if n not in target.links}
+        plan.compute(found)
+        assert worst_difference(target, found, one_by_one(target, values)) < 1e-12
+    assert step.holds
+
+
+def test_a_program_that_differs_is_not_used() -> None:
+    """Negative control: the program of another recursion."""
+    data = averages(30)[1]
+    target, other = (target_of(pose_any(averages(30, f)[0], data, None)) for f in (1.0, 1.001))
+    plan, wrong = LinkPlan(target, target.links), LinkPlan(other, other.links)
+    values = a_state(target, 0)
+    expected = one_by_one(target, values)
+    for step, unlike in zip(plan.steps, wrong.steps, strict=True):
+        if isinstance(step, Recursion):
+            assert isinstance(unlike, Recursion)
+            step.program = unlike.program
+    for _ in range(2):
+        found = dict(values)
+        plan.compute(found)
+        assert worst_difference(target, found, expected) == 0.0
+    assert [s.holds for s in plan.steps if isinstance(s, Recursion)] == [False]
+
+
+def test_recursions_are_not_written_out_term_by_term() -> None:
+    dbn, data = averages(80)
+    for steps, is_long in ((80, True), (8, False)):
+        problem = pose_any(dbn, {"y": data["y"][:steps]}, None)
+        said = conjugate_kernel(Blanket(target_of(problem), "level"))
+        assert (isinstance(said, str) and "made of each other" in said) is is_long
+    text = str(bmc.explain(dbn, data))
+    assert "3 free numbers jointly" in text

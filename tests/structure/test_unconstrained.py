@@ -18,6 +18,7 @@ from bayesmc.expression import elementwise, ordered
 from bayesmc.network import pose
 from bayesmc.passes import alike
 from bayesmc.structure import free_nodes, free_terms, unconstrained
+from bayesmc.structure.free_terms import Elements
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
 from bayesmc.testing import session
@@ -319,16 +320,20 @@ def without_jacobian(self: Any, part: Any, above: Any) -> Any:
     return value, elementwise(np.multiply, 0.0, volume)
 
 
-def without_mask(found: Target, term: Any, above: Any, is_inside: bool = False) -> Any:
-    return ELEMENTS(found, replace(term, mask=None), above, is_inside)
+def without_mask(found: Target, terms: Any, above: Any) -> Any:
+    return ELEMENTS(found, [replace(term, mask=None) for term in terms], above)
 
 
-def not_broadcast(found: Target, term: Any, above: Any, is_inside: bool = False) -> Any:
+def not_broadcast(found: Target, terms: Any, above: Any) -> Any:
     """The first element in place of all."""
-    made = ELEMENTS(found, term, above, is_inside)
-    if term.name != "x":
-        return made
-    return unconstrained.pick([made], np.zeros(made.size, int))
+
+    def first(log: Any) -> Any:
+        return unconstrained.pick([log], np.zeros(log.size, int))
+
+    made = ELEMENTS(found, terms, above)
+    return [
+        Elements(*map(first, m)) if t.name == "x" else m for t, m in zip(terms, made, strict=True)
+    ]
 
 
 def of_stale_data(found: Target, expressions: Any) -> Any:
@@ -336,7 +341,7 @@ def of_stale_data(found: Target, expressions: Any) -> Any:
     return KNOWN(replace(found, known=stale), expressions)
 
 
-EXPRESSIONS, ELEMENTS = free_nodes.FreeNode.expressions, unconstrained.elements
+EXPRESSIONS, ELEMENTS = free_nodes.FreeNode.expressions, unconstrained.elements_of
 KNOWN = free_terms.known_values
 
 
@@ -344,8 +349,8 @@ KNOWN = free_terms.known_values
     ("where", "what", "fault", "told"),
     [
         (free_nodes.FreeNode, "expressions", without_jacobian, "change of volume"),
-        (unconstrained, "elements", without_mask, "'y'"),
-        (unconstrained, "elements", not_broadcast, "'x'"),
+        (unconstrained, "elements_of", without_mask, "'y'"),
+        (unconstrained, "elements_of", not_broadcast, "'x'"),
         (free_terms, "known_values", of_stale_data, "'y'"),
     ],
 )

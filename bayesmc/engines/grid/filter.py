@@ -21,6 +21,7 @@ from bayesmc.engines.filtering import (
     quiet,
 )
 from bayesmc.engines.grid.automatic import FoundGrid
+from bayesmc.engines.grid.chain import increments_along
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.posterior import (
     GridBelief,
@@ -165,6 +166,16 @@ class GridFilter(GridOptions, FilterEngine):
     def taking(self, problem: SeriesProblem, found: FoundGrid | None) -> None:
         """Let a problem be filtered on a grid found for another, so that like evidences differ smoothly."""
         self._search.take(problem, found)
+
+    def log_evidence(self, problem: SeriesProblem) -> tuple[float, float]:
+        """The log evidence alone, and the mass that the worst slice after the first lost, or had too much."""
+        mover, _ = self._start(problem)
+        with quiet():
+            increments = increments_along(mover, problem.series)
+        if increments is not None:
+            return float(increments.sum()), mover.off
+        asked = self.filter(problem, np.random.SeedSequence(0), progress=False)
+        return float(np.sum(asked.log_marginal_likelihood)), mover.off
 
     @property
     def _search(self) -> GridSearch:

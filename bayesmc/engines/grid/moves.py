@@ -34,7 +34,7 @@ from bayesmc.shapes import Shape
 #: probability of bad parameters from which on they are the user's to hear of
 COUNTS = 1e-8
 #: predictions below which sums have underflowed, and the share of a slice that may be lost so
-_TINY, _LOST = 1e-290, 1e-9
+TINY, LOST = 1e-290, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +81,8 @@ class GridMover:
         self.model, self.tolerance = model, tolerance
         self.edges = Edges(model.slices, model.axes)
         self.warned: set[str] = set()
+        #: mass that the worst slice after the first lost, or had too much
+        self.off = 0.0
 
     def move(self, cells: Cells | None, row: Row) -> Cells:
         """The belief about a slice, from the one before (None: slice 0) and its row.
@@ -241,6 +243,8 @@ class GridMover:
             return np.ones(np.shape(log_mass))
         mass = np.asarray(np.exp(log_mass).sum(axis=axes))
         off = np.abs(mass - 1)
+        if now.row.t:
+            self.off = max(self.off, float(np.max(off)))
         if "mass" in self.warned or not np.any(off > self.tolerance):
             return mass
         worst = float(np.asarray(mass).flat[int(np.argmax(off))])
@@ -339,9 +343,9 @@ class GridMover:
         self, row: Row, predicted: np.ndarray, rest: np.ndarray, level: np.ndarray
     ) -> None:
         """Refuse to go on where cells that the belief cannot tell from zero may hold all there is."""
-        lost = predicted < _TINY
+        lost = predicted < TINY
         if lost.any() and np.any(
-            np.where(lost, np.log(_TINY) + rest, -np.inf) > level + np.log(_LOST)
+            np.where(lost, np.log(TINY) + rest, -np.inf) > level + np.log(LOST)
         ):
             raise ZeroProbabilityError(
                 f"GridFilter: what was seen in slice {row.t} is so far from what the belief before it allows "

@@ -159,7 +159,7 @@ class GridModel(GridSlices):
         was: tuple[int, ...],
     ) -> Block:  # fmt: skip
         """A table, scaled where it reads the slice before."""
-        log, invalid, problem = self._log(first, name, base, mask, count)
+        log, invalid, problem = self.log(first, name, base, mask, count)
         was = tuple(k for k in was if log.shape[k] > 1)
         if not was:
             return Block(log, None, invalid, problem)
@@ -181,7 +181,7 @@ class GridModel(GridSlices):
             found[name] = value
         return found
 
-    def _log(
+    def log(
         self, first: bool, name: str, base: Values, mask: np.ndarray | None, count: int
     ) -> tuple[np.ndarray, np.ndarray | None, ParameterError | None]:
         """Log densities, shape ``(*batch, *apart)``, and where parameters are bad."""

@@ -22,6 +22,7 @@ import numpy as np
 from bayesmc.engines.mcmc.climbing import row_logs
 from bayesmc.engines.mcmc.jointly import continuous, density_of
 from bayesmc.errors import BayesmcError
+from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
 
@@ -128,6 +129,7 @@ def _from_near(
     """
     rows = points.shape[1]
     of, wide = np.arange(rows), np.repeat(np.arange(rows), len(_NEAR))
+    density = in_machine_code(density, _STEPS, len(wide))  # most paths take no more
     held = {n: v[wide] if n in target.chain else v for n, v in values.items()}
     target.refresh(held, target.chain)
     spread = np.tile(_NEAR, rows)[:, None]

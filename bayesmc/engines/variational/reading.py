@@ -45,7 +45,7 @@ from bayesmc.passes.log_density import family_of
 from bayesmc.passes.moments import Hidden
 from bayesmc.passes.reads import element_read
 from bayesmc.passes.widening import widened
-from bayesmc.structure.free_terms import elements, known_values
+from bayesmc.structure.free_terms import elements_of, known_values
 from bayesmc.structure.target import Target, Term
 
 #: entries of one term at all joint states of its finite nodes
@@ -119,7 +119,8 @@ class TermReader:
         whole = term.expression
         moving = frozenset() if whole is None else whole.leaves & {*self.hidden, *self.tables}
         if not moving:  # says why it is not followed, too
-            log = elements(self.target, term, self.above, term.name in self.above)
+            (either,) = elements_of(self.target, [term], self.above)
+            log = either.inside if term.name in self.above else either.anywhere
             return Sum(term.name, reduction(np.add, log, (0,)))
         assert whole is not None
         given = self._given(term, whole)
