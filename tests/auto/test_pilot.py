@@ -12,6 +12,7 @@ import scipy.stats
 
 import bayesmc as bmc
 from bayesmc.auto.pilot import CountedModel, _counted
+from bayesmc.lowering import machine
 from bayesmc.network import pose
 
 
@@ -91,13 +92,27 @@ CASES: dict[str, tuple[Callable[[], Any], type]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_cheaper_engine_is_taken(name: str) -> None:
+def test_the_cheaper_engine_is_taken(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     make, engine = CASES[name]
-    chosen = bmc.explain(*make())
+    machine.is_available.cache_clear()
+    monkeypatch.setattr(machine.importlib.util, "find_spec", lambda name: None)
+    try:
+        chosen, again = bmc.explain(*make()), bmc.explain(*make())
+    finally:
+        machine.is_available.cache_clear()
     assert isinstance(chosen.engine, engine)
     assert "did best in a short pilot" in chosen.reasons[0] and "effective of" in chosen.reasons[0]
     assert "Gibbs" in chosen.refused
-    assert bmc.explain(*make()).reasons == chosen.reasons  # no clock decides
+    assert again.reasons == chosen.reasons  # no clock decides
+
+
+@pytest.mark.skipif(not machine.is_available(), reason="llvmlite is not installed")
+@pytest.mark.parametrize("make", [arma, garch])
+def test_in_machine_code_recursions_are_followed(make: Any) -> None:
+    """A gradient costs less than the call of one density: no pilot is run."""
+    chosen = bmc.explain(*make())
+    assert isinstance(chosen.engine, bmc.Gibbs)
+    assert "Hamiltonian" in chosen.reasons[0] and "pilot" not in str(chosen)
 
 
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
