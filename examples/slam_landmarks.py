@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import AndAngle, PoseNormal, bearing_to, compose, range_to, transform, wrap
+from bayesmc.robotics import AndAngle, bearing_to, compose, range_to, transform, wrap
 from examples import picture, reference
 from examples.robot_landmarks import Drive, ellipse, marks_seen, write_mrclam
 
@@ -39,7 +39,7 @@ LONG, FAR, LATE = (
     0.033,
 )  # of the camera: share and m that depths are too long by, s of delay
 # Wider than one error, which lasts over many readings: m, share of what is read, rad
-DEPTH, SHARE, BEARING = 0.1, 0.02, 0.03
+DEPTH, SHARE, BEARING = 0.2, 0.02, 0.06
 STRAY = 0.002  # share of readings that wear the barcode of another landmark
 # m, m, rad: what a reading of no landmark, or of another one, is about
 ANYWHERE, ANYWHERE_DEPTH, ANYWHERE_BEARING = 4.0, 2.0, 0.5
@@ -172,24 +172,32 @@ def one_by_one(readings: Readings) -> Readings:
 
 
 def robot(start: np.ndarray, **plates: int) -> bmc.DynamicBayesNet:
-    """Gains of the wheels, and the pose."""
+    """The pose, and the gains of the wheels on the way to it, as one vector of five numbers.
+
+    Gains of nodes of their own would be drawn blindly; in one vector with the pose, the proposal of FastSLAM
+    2.0 leads them to where the way ended. The heading is a number that goes on beyond a full turn.
+    """
     dbn = bmc.DynamicBayesNet("slam", plates=plates)
     for name, shape in (("motion", (3,)), ("bend", (3, 2)), ("noise", (3, 3))):
         dbn.input(name, event_shape=shape)
     for name in ("seconds", "spin"):
         dbn.input(name)
+    first = bmc.MvNormal(
+        np.append(start, [1.0, 1.0]), scale_diag=[1e-3, 1e-3, 1e-3, SPREAD, SPREAD]
+    )
 
-    @dbn.node(initial=bmc.MvNormal([1.0, 1.0], scale_diag=[SPREAD, SPREAD]))
-    def gain(gain_prev, seconds):
+    @dbn.node(initial=first)
+    def pose(pose_prev, motion, bend, noise, seconds):
         kept = np.exp(-seconds / LASTING)[..., None]
-        scale = SPREAD * np.sqrt(1 - kept**2 + 1e-9)
-        return bmc.MvNormal(1 + kept * (gain_prev - 1), scale_diag=scale * np.ones(2))
-
-    @dbn.node(initial=PoseNormal(start, scale_diag=[1e-3, 1e-3, 1e-3]))
-    def pose(pose_prev, gain, motion, bend, noise):
+        gain = 1 + kept * (pose_prev[..., 3:] - 1)
+        anew = SPREAD**2 * (1 - kept**2 + 1e-9)
         turn = turned(pose_prev[..., 2])
-        driven = compose(pose_prev, motion + np.matvec(bend, gain - 1))
-        return PoseNormal(driven, cov=turn @ noise @ np.swapaxes(turn, -1, -2))
+        driven = pose_prev[..., :3] + np.matvec(turn, motion + np.matvec(bend, gain - 1))
+        steered = np.eye(5, 3) @ turn
+        ends = steered @ bend + np.eye(5, 2, -3)  # where a way ends moves with the gains on it
+        of_gains = anew[..., None] * ends @ np.swapaxes(ends, -1, -2)
+        of_way = steered @ noise @ np.swapaxes(steered, -1, -2)
+        return bmc.MvNormal(np.concatenate([driven, gain], axis=-1), of_gains + of_way)
 
     return dbn
 
@@ -211,6 +219,7 @@ def by_camera(pose: Any, place: Any, spin: Any) -> tuple[np.ndarray, np.ndarray]
     It tells the distance by how large a barcode looks, which goes by the depth along the axis of the camera
     and not by the range; MRCLAM 6 writes the depth. Its pictures are some 33 ms old.
     """
+    pose = pose[..., :3]
     angle = bearing_to(pose, place)
     deep = range_to(pose, place) * np.cos(angle)
     return (1 + LONG) * deep + FAR, angle + LATE * spin

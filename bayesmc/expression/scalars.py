@@ -36,6 +36,8 @@ _PER_CALL = 30
 _MATRIX = 5
 #: elements of a graph up to which code is made
 _MOST = 10_000
+#: terms of one sum in a line of code
+_SIGNS = 100
 
 
 class SmallProgram:
@@ -247,13 +249,21 @@ def _written(
 
 def _reduced(ufunc: np.ufunc, row: list[str], lines: _Lines) -> str:
     if ufunc is np.add:
-        return lines(" + ".join(row)) if row else "0.0"
+        return _summed(row, lines)
     if not row:
         raise NotImplementedError
     found = row[0]
     for x in row[1:]:
         found = _operation(ufunc, (found, x), lines)
     return found
+
+
+def _summed(terms: list[str], lines: _Lines) -> str:
+    """Their sum, of many in parts: Python's compiler goes one level deeper with every sign."""
+    while len(terms) > _SIGNS:
+        starts = range(0, len(terms), _SIGNS)
+        terms = [lines(" + ".join(terms[k : k + _SIGNS])) for k in starts]
+    return lines(" + ".join(terms)) if terms else "0.0"
 
 
 def _multiplied(node: Call, operands: list[np.ndarray], lines: _Lines) -> np.ndarray:
@@ -276,7 +286,7 @@ def _multiplied(node: Call, operands: list[np.ndarray], lines: _Lines) -> np.nda
                 x, y = one[tuple(where[c] for c in left)], other[tuple(where[c] for c in right)]
                 if "0.0" not in (x, y):
                     terms.append(" * ".join(sorted((x, y))))
-            found.append(lines(" + ".join(terms)) if terms else "0.0")
+            found.append(_summed(terms, lines))
     return _objects(found, node.shape)
 
 

@@ -12,6 +12,9 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from bayesmc.expression import Constant, Expression
+from bayesmc.passes.logarithms import log_of
+
 Partial = Callable[..., Any]
 
 _SQRT_PI = float(np.sqrt(np.pi))
@@ -46,6 +49,17 @@ def _wraps(a: Any, b: Any, y: Any) -> Any:
 def _chosen(a: Any, b: Any, y: Any) -> Any:
     """Slope by the first argument of what is chosen for being larger, or smaller, than the second."""
     return _kinked(np.equal(y, a), np.equal(a, b))
+
+
+def _share(a: Any, b: Any) -> Any:
+    """The first over the second, which is nothing where the first is: 0 log 0 stays 0 beside it."""
+    quotient = np.true_divide(a, b)
+    above, below = (getattr(e, "expression", None) for e in (a, b))
+    if isinstance(above, Constant) and above.value.all():
+        return quotient
+    if isinstance(below, Expression) and log_of(below) is not None:
+        return quotient
+    return np.where(np.equal(a, 0.0), 0.0, quotient)
 
 
 def _i1e_slope(x: Any, y: Any) -> Any:
@@ -135,8 +149,8 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
     special.digamma: (lambda x, y: special.zeta(2.0, x),),
     special.i0e: (lambda x, y: special.i1e(x) - np.sign(x) * y,),
     special.i1e: (_i1e_slope,),
-    special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: np.true_divide(a, b)),
-    special.xlog1py: (lambda a, b, y: np.log1p(b), lambda a, b, y: np.true_divide(a, 1.0 + b)),
+    special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: _share(a, b)),
+    special.xlog1py: (lambda a, b, y: np.log1p(b), lambda a, b, y: _share(a, 1.0 + b)),
 }
 
 

@@ -107,6 +107,12 @@ class UnconstrainedDensity:
             slopes = np.where(np.isfinite(slopes), slopes, 0.0)
         return value, slopes
 
+    def is_told(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None = None) -> np.ndarray:
+        """Which derivatives are numbers at one point, shape ``(size,)``; all where the density is none."""
+        value, slopes = self._both(self._given(u, values))
+        found = np.isfinite(slopes) | ~np.isfinite(value)
+        return np.broadcast_to(found, (self.size,))
+
     def constrain(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None = None) -> Values:
         """Node -> stored value, shape ``(*batch, *plates, *event)``, inside its support."""
         above = self._above(values)

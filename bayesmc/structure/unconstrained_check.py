@@ -70,6 +70,7 @@ def hold_against_model(
     inside = {t.name for table in tables for t in table.terms}
     names = [t.name for t in terms]
     seen, agreed = [False] * len(terms), [False] * len(plain)
+    told = np.zeros(density.size, dtype=bool)
 
     def is_enough() -> bool:
         return all(seen) and all(agreed)
@@ -99,6 +100,8 @@ def hold_against_model(
         _check_sum(density, outside, u, values)
         for k, (a, b) in enumerate(zip(given, written, strict=True)):
             agreed[k] |= _is_written(a, b)
+        if not told.all():
+            told |= density.is_told(u, values)
     for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
             raise UnsupportedError(
@@ -108,6 +111,11 @@ def hold_against_model(
     if not all(agreed):
         name = [*names, *density.names][agreed.index(False)]
         raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
+    if not told.all():
+        label = density.labels[int(np.argmin(told))]
+        raise UnsupportedError(
+            f"the derivative of the log density by {label!r} is no number wherever it was tried"
+        )
 
 
 def other_values(density: UnconstrainedDensity, k: int) -> Values:

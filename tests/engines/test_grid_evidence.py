@@ -152,8 +152,8 @@ def test_a_grid_that_does_not_fit_is_not_kept(monkeypatch: pytest.MonkeyPatch) -
 
 def test_trials_that_take_far_more_cells_are_refused() -> None:
     dbn, data, inputs = counts(100)
-    found, unknowns = (
-        of_template(dbn, pose_series(dbn, data, inputs), data, inputs, ("s", "effect"), False, None)
+    found, unknowns = of_template(
+        dbn, pose_series(dbn, data, inputs), data, inputs, ("s", "effect"), False, None
     )
     wide, narrow = (
         unknowns.numbers({"s": np.array(s), "effect": np.array(-0.2)}) for s in (0.3, 0.004)

@@ -16,6 +16,7 @@ from bayesmc.expression import (
     elementwise,
     leaf,
     pick,
+    scalars,
     trace,
 )
 from bayesmc.expression.functions import product
@@ -91,3 +92,14 @@ def test_not_a_number_stays_so() -> None:
     least = elementwise(np.maximum, pick([x], 0), pick([x], 1))
     for pair in ([np.nan, 1.0], [1.0, np.nan]):
         assert np.isnan(SmallProgram([least])({"x": np.array(pair)})[0])
+
+
+def test_long_sums_are_no_deep_lines() -> None:
+    """Python's compiler gives up where one line nests some thousand signs."""
+    x = leaf("x", (2000,))
+    total = trace(lambda x: np.sum(x * x, axis=-1), [TracedArray(x)])
+    inner = trace(lambda x: np.vecdot(x, x), [TracedArray(x)])
+    at = RNG.normal(size=2000)
+    for root in (total, inner):
+        function, _ = scalars._compiled((root,), (("x", 1, 2000),))
+        assert function([at.tolist()]) == pytest.approx([at @ at])

@@ -370,6 +370,24 @@ def test_wrong_gradients_fail_the_check() -> None:
         check(shifted, np.random.default_rng(0))
 
 
+def test_counts_that_cannot_be_leave_the_slopes_of_others() -> None:
+    """``0 log 0`` is nothing, and so is its derivative: nobody at risk, and nobody died."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("n", lambda a: bmc.Poisson(np.array([1.0, 0.0, 2.0]) * np.exp(a)), plates="i")
+    density = unconstrained_density(target_of(pose(net, {"n": [3, 0, 1]})))
+    _, slope = density.with_gradient(np.array([0.3]))
+    assert slope[0] == pytest.approx(4 - 3 * np.exp(0.3) - 0.3)
+
+
+def test_a_derivative_that_is_no_number_anywhere_is_refused() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda a: bmc.Normal(a + np.sqrt(np.square(a - a)), 1.0))
+    with pytest.raises(UnsupportedError, match="derivative of the log density by 'a' is no number"):
+        unconstrained_density(target_of(pose(net, {"y": 1.0})))
+
+
 def of_slices(steps: int) -> Target:
     dbn = bmc.DynamicBayesNet("counts")
 

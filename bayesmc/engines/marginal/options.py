@@ -285,7 +285,11 @@ def reasons(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:
         return ()
     seen = problem.series.observed
     inner = ", ".join(repr(n) for n in split.names if n not in seen or n not in split.inner)
-    return (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
+    return (
+        (f"hidden nodes can be sampled, and {inner} integrated out given the others",)
+        if inner
+        else ()
+    )
 
 
 def endless_sums(engine: Any, problem: SeriesProblem) -> tuple[str, ...]:

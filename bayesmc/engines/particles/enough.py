@@ -93,7 +93,7 @@ def affordable(slices: int, budget: int, keep: bool) -> int:
     return max(START, min(MOST, share // max(slices, 1)))
 
 
-def collapsed(filtered: FilteredParticles) -> str | None:
+def collapsed(filtered: FilteredParticles, engine: Any) -> str | None:
     """What is said where many slices rest on what is little more than one particle.
 
     A surprising row now and then does that to any filter, and the next rows mend it.
@@ -111,8 +111,8 @@ def collapsed(filtered: FilteredParticles) -> str | None:
     return (
         f"in {int(poor[:, worst].sum())} of {len(own)} slices the {most} particles are worth less than "
         f"{COLLAPSED:g} equally weighted ones (weight_ess; {own[at]:.1f} in slice {filtered.start + at}), so "
-        "means, spreads and the evidence rest on one of them: use more particles, a proposal= that looks at "
-        "the observations, or less narrow noise"
+        f"means, spreads and the evidence rest on one of them: use more particles, {_looking(engine)}or less "
+        "narrow noise"
     )
 
 
@@ -149,8 +149,8 @@ def uncertain(filtered: FilteredParticles, engine: Any, carried: float = 0.0) ->
     )
     return (
         f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
-        f"be off as well ({why}); use {_more(filtered, engine, carried)}, a "
-        "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
+        f"be off as well ({why}); use {_more(filtered, engine, carried)}, {_looking(engine)}or a model to "
+        "which such rows are less of a surprise"
     )
 
 
@@ -159,12 +159,19 @@ def warn_of_errors(filtered: FilteredParticles, engine: Any, carried: float = 0.
 
     ``carried`` is what ``price`` takes.
     """
-    text = collapsed(filtered) or uncertain(filtered, engine, carried)
+    text = collapsed(filtered, engine) or uncertain(filtered, engine, carried)
     if text is not None:
         warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _looking(engine: Any) -> str:
+    """How to have particles drawn with a look at the observations, where they are not."""
+    if engine.proposal is None:
+        return "a proposal= that looks at the observations, "
+    return "" if engine.auxiliary else "auxiliary=True, "
 
 
 def _more(filtered: FilteredParticles, engine: Any, carried: float) -> str:
