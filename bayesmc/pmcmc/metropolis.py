@@ -58,8 +58,8 @@ class ParticleMetropolis(ParticleEngine):
     that lie evenly, which takes a fifth of the particles or less for the same error. The estimate has no bias
     either way.
 
-    It takes slices times particles, chains and sweeps, which ``explain`` says before; a processor moves a
-    million particles or two in a second.
+    It takes slices times particles, chains and sweeps, which ``explain`` says before; a processor moves
+    something like a million particles of one number in a second.
 
     References
     ----------
