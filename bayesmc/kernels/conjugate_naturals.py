@@ -63,9 +63,8 @@ from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.features import LOG, LOG1M, Feature, statistics
 from bayesmc.passes.log_density import log_density
-from bayesmc.passes.reads import same_along
+from bayesmc.passes.reads import is_recursion, same_along
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.recursion import is_recursion
 from bayesmc.structure.target import Term
 
 #: parameters of vectors -> how a node must enter them

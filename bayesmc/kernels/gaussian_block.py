@@ -28,7 +28,7 @@ from bayesmc.kernels.gaussian_layout import BlockSums, Components, Layout
 from bayesmc.kernels.gaussian_rows import NormalRows
 from bayesmc.kernels.gaussian_terms import NormalTerms
 from bayesmc.linalg.patterns import cholesky, lapack, triangular
-from bayesmc.structure.recursion import is_recursion
+from bayesmc.passes.reads import is_recursion
 from bayesmc.structure.target import Target, Values
 
 #: components that one dense matrix may have, and how far from the diagonal a band may reach

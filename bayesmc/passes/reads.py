@@ -6,7 +6,7 @@ broadcasting. Where two of them meet in one entry there is no answer, unless the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
@@ -31,6 +31,9 @@ from bayesmc.expression import (
     reshape,
 )
 from bayesmc.passes.arithmetic import rewritten
+
+#: operations on a node in all terms that are few, and how often each may be in one
+_LONG, _SHARED = 2000, 8
 
 #: functions of whole matrices: their batch axes are all but the last two
 _OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det", "upper_inverse"))
@@ -156,6 +159,31 @@ def sunk(root: Expression, name: str) -> Expression:
     (<Pick ()>, <Elementwise exp ()>)
     """
     return rewritten([root], lambda node, new: _sunk(node.with_operands(new), name))[0]
+
+
+def is_recursion(terms: Iterable[Expression], name: str) -> bool:
+    """Whether terms share most of what they make of a node, as those of a recursion over time do.
+
+    Whoever writes out coefficients term by term would write the square of its length.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import elementwise, leaf
+    >>> from bayesmc.passes.reads import is_recursion
+    >>> x, made = leaf("x", ()), [leaf("x", ())]
+    >>> for _ in range(100):
+    ...     made.append(elementwise(np.add, elementwise(np.multiply, made[-1], 0.5), x))
+    >>> is_recursion(made, "x"), is_recursion(made[:20], "x")
+    (True, False)
+    """
+    once: set[Expression] = set()
+    count = 0
+    for term in terms:
+        own = [node for node in ordered(term) if name in node.leaves]
+        once.update(own)
+        count += len(own)
+    return count > max(_LONG, _SHARED * len(once))
 
 
 # ---- private ------------------------------------------------------------------------------------

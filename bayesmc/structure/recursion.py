@@ -6,13 +6,13 @@ no two of which can be computed at once: called one by one, their functions take
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from itertools import groupby
 
 import numpy as np
 
 from bayesmc.errors import BayesmcError, TraceError
-from bayesmc.expression import Call, Expression, Program, ordered
+from bayesmc.expression import Call, Program, ordered
 from bayesmc.network.expressions import value_of
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.shapes import read_only
@@ -20,33 +20,6 @@ from bayesmc.structure.like_functions import FEWEST, Facts, LikeLinks, LinkSteps
 
 #: how far its values may be from those of the functions
 _CLOSE = 1e-9
-#: operations on a node in all terms that are few, and how often each may be in one
-_LONG, _SHARED = 2000, 8
-
-
-def is_recursion(terms: Iterable[Expression], name: str) -> bool:
-    """Whether terms share most of what they make of a node, as those of a recursion over time do.
-
-    Whoever writes out coefficients term by term would write the square of its length.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesmc.expression import elementwise, leaf
-    >>> from bayesmc.structure.recursion import is_recursion
-    >>> x, made = leaf("x", ()), [leaf("x", ())]
-    >>> for _ in range(100):
-    ...     made.append(elementwise(np.add, elementwise(np.multiply, made[-1], 0.5), x))
-    >>> is_recursion(made, "x"), is_recursion(made[:20], "x")
-    (True, False)
-    """
-    once: set[Expression] = set()
-    count = 0
-    for term in terms:
-        own = [node for node in ordered(term) if name in node.leaves]
-        once.update(own)
-        count += len(own)
-    return count > max(_LONG, _SHARED * len(once))
 
 
 class Recursion:
