@@ -238,3 +238,14 @@ def test_refusals() -> None:
     opaque.add("y", lambda x: bmc.Normal(1.0 if x > 0 else -1.0, 1.0), vectorize=True)
     with pytest.raises(UnsupportedError, match=r"this net has none: .*'y'"):
         bmc.infer(opaque, {"y": 1.0}, engine=bmc.HamiltonianMonteCarlo())
+
+
+def test_advice_about_cut_trajectories_leaves_out_what_is_done() -> None:
+    deep = bmc.HamiltonianMonteCarlo(200, warmup=200, max_depth=1, metric="dense")
+    _, told = quietly(line(), LINE, engine=deep, rng=0)
+    (text,) = [t for t in told if "were cut" in t]
+    assert "metric=" not in text and "max_depth=3" in text
+    shallow = bmc.HamiltonianMonteCarlo(200, warmup=200, max_depth=1, metric="diagonal")
+    _, told = quietly(line(), LINE, engine=shallow, rng=0)
+    (text,) = [t for t in told if "were cut" in t]
+    assert 'metric="dense"' in text

@@ -31,6 +31,8 @@ _CUT = 0.01
 _LEAST_RATIO = 0.3
 #: standard errors by which ranks of a number must be off where trajectories diverged; numbers looked at
 _LIMIT, _NUMBERS = 4.0, 2_000_000
+#: share of trajectories from which on nearly all are cut
+_MOSTLY = 0.9
 
 
 def faulty_trajectories(
@@ -60,7 +62,7 @@ def faulty_trajectories(
         if cut > _CUT * moves:
             yield (
                 f"{cut} of {moves} trajectories were cut at {kernel.max_depth} doublings, so that draws stay "
-                'near each other; use metric="dense", a larger max_depth=, or numbers less correlated'
+                f"near each other; {_longer(posterior, kernel, cut > _MOSTLY * moves)}"
             )
         ratio = float(np.nanmin(kernel.energy_ratio(memory))) if memory["moves"] > 100 else np.inf
         if ratio < _LEAST_RATIO:
@@ -91,6 +93,26 @@ def _apart_from(kernel: Hamiltonian, kernels: list[Any]) -> str:
     ):
         return "declare effects apart from their scale (z ~ Normal(0, 1), b = sigma * z), "
     return ""
+
+
+def _longer(
+    posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian, is_nearly_all: bool
+) -> str:
+    """What helps trajectories that end nowhere, in words, without what is done already."""
+    own = getattr(posterior.engine, "max_depth", None)
+    deeper = f"max_depth={kernel.max_depth + 2}"
+    ways = [] if kernel.metric.kind == "dense" else ['metric="dense"']
+    if own is None:
+        options = ", ".join([*ways, deeper])
+        said = f"use HamiltonianMonteCarlo({options}), or numbers less correlated"
+    else:
+        said = f"use {', '.join([*ways, deeper])}, or numbers less correlated"
+    if not is_nearly_all:
+        return said
+    return (
+        f"{said}; where nearly all are cut, numbers are of very different size (measure in units of their "
+        "spread), priors are far wider than what the data tell, or chains start far away (start=)"
+    )
 
 
 def _shorter(posterior: ChainsPosterior | ChainsSums, memory: Mapping[str, Any]) -> str:
