@@ -531,7 +531,7 @@ def draw(drive: Drive, readings: Readings, found: Any, kalman: Any, spread: np.n
         ("FastSLAM", found, picture.OTHER),
         ("EKF-SLAM", kalman, "#2a78b5"),
     ):
-        error = np.hypot(*(belief.mean("pose") - readings.truth)[:, :2].T)
+        error = np.hypot(*(belief.mean("pose")[:, :2] - readings.truth[:, :2]).T)
         label = f"{name}: {readings.rmse(belief.mean('pose')):.2f} m"
         ax.plot(readings.times, error, color=colour, lw=1, label=label)
     ax.set(xlim=(0, readings.times[-1]), ylim=(0, None), xlabel="s", ylabel="m")
