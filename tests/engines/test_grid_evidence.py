@@ -14,11 +14,10 @@ from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.errors import ParameterError
 from bayesmc.learning.series_evidence import SeriesEvidence, of_template
 
-DATA = np.random.default_rng(20261128)
-
 
 def counts(steps: int = 400) -> tuple[bmc.DynamicBayesNet, dict[str, Any], dict[str, Any]]:
     """Counts of a random walk; with an input, and rows that are missing."""
+    rng = np.random.default_rng(20261128)  # the same whichever tests ran before
     dbn = bmc.DynamicBayesNet("counts")
     dbn.input("law")
     dbn.add_static("s", bmc.HalfNormal(0.5))
@@ -27,10 +26,10 @@ def counts(steps: int = 400) -> tuple[bmc.DynamicBayesNet, dict[str, Any], dict[
     dbn.add("n", lambda x, law, effect: bmc.Poisson(np.exp(x + effect * law)))
     dbn.add("z", lambda x: bmc.Normal(x, 0.7))
     law = (np.arange(steps) > steps // 2).astype(float)
-    x = 1.5 + np.cumsum(0.05 * DATA.normal(size=steps))
-    z = x + 0.7 * DATA.normal(size=steps)
-    z[DATA.random(steps) < 0.3] = np.nan
-    return dbn, {"n": DATA.poisson(np.exp(x - 0.3 * law)), "z": z}, {"law": law}
+    x = 1.5 + np.cumsum(0.05 * rng.normal(size=steps))
+    z = x + 0.7 * rng.normal(size=steps)
+    z[rng.random(steps) < 0.3] = np.nan
+    return dbn, {"n": rng.poisson(np.exp(x - 0.3 * law)), "z": z}, {"law": law}
 
 
 def volatility(steps: int = 300) -> tuple[bmc.DynamicBayesNet, dict[str, Any], None]:
@@ -44,7 +43,7 @@ def volatility(steps: int = 300) -> tuple[bmc.DynamicBayesNet, dict[str, Any], N
         initial=lambda phi, sd: bmc.Normal(0.0, sd / np.sqrt(1 - phi**2)),
     )
     dbn.add("r", lambda h: bmc.Normal(0.0, np.exp(h / 2)))
-    return dbn, {"r": DATA.normal(size=steps)}, None
+    return dbn, {"r": np.random.default_rng(1).normal(size=steps)}, None
 
 
 CASES = {
@@ -144,10 +143,10 @@ def test_a_grid_that_does_not_fit_is_not_kept(monkeypatch: pytest.MonkeyPatch) -
     assert found.settle(wide)
     assert np.isfinite(found.value(wide))
     assert found.value(narrow) == pytest.approx(alone, abs=1e-3)
-    # negative control: without a look at the mass the grid is taken, and tells something else
+    # negative control: without a look at the mass the grid is taken, and is off by a hundred times as much
     assert found.settle(wide)
     monkeypatch.setattr(found, "_off", np.inf)
-    assert found.value(narrow) > alone + 1.0
+    assert abs(found.value(narrow) - alone) > 0.1
 
 
 def test_trials_that_take_far_more_cells_are_refused() -> None:

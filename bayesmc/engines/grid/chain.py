@@ -67,7 +67,7 @@ def increments_along(mover: GridMover, series: Series) -> np.ndarray | None:
             mover.off = max(mover.off, abs(float(predicted.sum()) - 1.0))
             probs = predicted * own
             total = float(probs.sum())
-            if not total > 0 or _underflows(predicted / share, share, own, total):
+            if not total > 0 or _underflows(predicted, share, own, total):
                 return None
             probs /= total
             found[low + k] = np.log(total) + top[k]
@@ -138,5 +138,5 @@ def _mask(seen: Observed, rows: slice) -> np.ndarray | None:
 
 def _underflows(predicted: np.ndarray, share: np.ndarray, own: np.ndarray, total: float) -> bool:
     """Whether cells that the belief cannot tell from zero may hold all there is."""
-    lost = predicted < TINY
+    lost = predicted < TINY * share
     return bool(lost.any() and TINY * float((share * own)[lost].max(initial=0.0)) > LOST * total)
