@@ -108,10 +108,9 @@ class UnconstrainedDensity:
         return value, slopes
 
     def is_told(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None = None) -> np.ndarray:
-        """Which derivatives are numbers at one point, shape ``(size,)``; all where the density is none."""
-        value, slopes = self._both(self._given(u, values))
-        found = np.isfinite(slopes) | ~np.isfinite(value)
-        return np.broadcast_to(found, (self.size,))
+        """Which derivatives are numbers at one point of positive density, shape ``(size,)``."""
+        _, slopes = self._both(self._given(u, values))
+        return np.broadcast_to(np.isfinite(slopes), (self.size,))
 
     def constrain(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None = None) -> Values:
         """Node -> stored value, shape ``(*batch, *plates, *event)``, inside its support."""

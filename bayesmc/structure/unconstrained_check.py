@@ -70,10 +70,10 @@ def hold_against_model(
     inside = {t.name for table in tables for t in table.terms}
     names = [t.name for t in terms]
     seen, agreed = [False] * len(terms), [False] * len(plain)
-    told = np.zeros(density.size, dtype=bool)
+    told, is_positive = np.zeros(density.size, dtype=bool), False
 
     def is_enough() -> bool:
-        return all(seen) and all(agreed)
+        return all(seen) and all(agreed) and bool(told.all())
 
     points = chain(_points(density), _positive(density, is_enough), _uphill(density, is_enough))
     for u, values in points:
@@ -100,7 +100,8 @@ def hold_against_model(
         _check_sum(density, outside, u, values)
         for k, (a, b) in enumerate(zip(given, written, strict=True)):
             agreed[k] |= _is_written(a, b)
-        if not told.all():
+        if not told.all() and np.isfinite(density.value(u, values)):
+            is_positive = True
             told |= density.is_told(u, values)
     for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
@@ -111,7 +112,7 @@ def hold_against_model(
     if not all(agreed):
         name = [*names, *density.names][agreed.index(False)]
         raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
-    if not told.all():
+    if is_positive and not told.all():
         label = density.labels[int(np.argmin(told))]
         raise UnsupportedError(
             f"the derivative of the log density by {label!r} is no number wherever it was tried"

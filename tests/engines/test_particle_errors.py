@@ -262,6 +262,52 @@ def test_the_run_that_answers_is_not_one_that_chose_the_number() -> None:
     assert found.log_marginal_likelihood == same.log_marginal_likelihood
 
 
+def steady() -> tuple[bmc.DynamicBayesNet, dict[str, Any]]:
+    """Position and velocity where next to nothing moves by itself.
+
+    The evidence is known well by few particles, the states of a slice are not.
+    """
+    moved = np.array([[1.0, 1.0], [0.0, 1.0]])
+    noise = 1e-4 * np.array([[1 / 3, 0.5], [0.5, 1.0]])
+    dbn = bmc.DynamicBayesNet()
+    start = bmc.MvNormal(np.zeros(2), np.diag([25.0, 1.0]))
+    dbn.add("s", lambda s_prev: bmc.MvNormal(np.matvec(moved, s_prev), noise), initial=start)
+    dbn.add("y", lambda s: bmc.Normal(s[..., 0], 4.0))
+    return dbn, {"y": dbn.sample(40, 1, rng=1)["y"][0]}
+
+
+def states_off(seed: int) -> tuple[float, float]:
+    """By how much means are off in standard deviations, and spreads, at the most."""
+    dbn, given = steady()
+    exact = bmc.filter(dbn, given)
+    found = bmc.filter(dbn, given, engine=bmc.ParticleFilter(), rng=seed)
+    off = np.abs(found.mean("s") - exact.mean("s")) / exact.std("s")
+    return float(off.max()), float(np.abs(found.std("s") / exact.std("s") - 1).max())
+
+
+def test_particles_grow_until_states_are_known() -> None:
+    """Of 120 runs with other seeds none is off by more than .23 and .13: beyond these bounds is no chance."""
+    found = [states_off(session.seed() + k) for k in range(4)]
+    assert max(mean for mean, _ in found) < 0.3
+    assert max(spread for _, spread in found) < 0.2
+
+
+def test_by_the_evidence_alone_they_are_too_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The negative control."""
+    monkeypatch.setattr("bayesmc.engines.particles.filter.of_states", lambda *given: {})
+    found = [states_off(session.seed() + k) for k in range(4)]
+    assert max(mean for mean, _ in found) > 0.3 or max(spread for _, spread in found) > 0.2
+
+
+def test_states_that_are_not_known_well_say_so() -> None:
+    """Few particles leave trajectories with few ancestors, though the evidence is known well."""
+    dbn, given = steady()
+    with pytest.warns(LowEssWarning, match="means of 's' off by.*a larger budget= than 16_000"):
+        found = bmc.smooth(dbn, given, engine=bmc.ParticleFilter(budget=16_000), rng=0)
+    assert found.log_marginal_likelihood_mcse < 0.5
+    assert (found.mcse("s") / found.std("s")).max() > 0.5
+
+
 @pytest.mark.parametrize("kind", ["step", "far outliers", "bursts"])
 def test_a_budget_that_is_spent_says_so(kind: str) -> None:
     engine = bmc.ParticleFilter(budget=400_000)

@@ -380,12 +380,16 @@ def test_counts_that_cannot_be_leave_the_slopes_of_others() -> None:
     assert slope[0] == pytest.approx(4 - 3 * np.exp(0.3) - 0.3)
 
 
-def test_a_derivative_that_is_no_number_anywhere_is_refused() -> None:
+@pytest.mark.parametrize("bounded", [False, True])
+def test_a_derivative_that_is_no_number_anywhere_is_refused(bounded: bool) -> None:
+    """Points at which something else cannot be say nothing of it."""
     net = bmc.BayesNet()
     net.add("a", bmc.Normal(0.0, 1.0))
     net.add("y", lambda a: bmc.Normal(a + np.sqrt(np.square(a - a)), 1.0))
+    net.add("b", bmc.Normal(0.0, 1.0))
+    net.add("z", lambda b: bmc.Uniform(b - 0.5, b + 0.5) if bounded else bmc.Normal(b, 1.0))
     with pytest.raises(UnsupportedError, match="derivative of the log density by 'a' is no number"):
-        unconstrained_density(target_of(pose(net, {"y": 1.0})))
+        unconstrained_density(target_of(pose(net, {"y": 1.0, "z": 2.0})))
 
 
 def of_slices(steps: int) -> Target:

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.dbn.slices import Slices
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.errors import LowEssWarning
 
@@ -29,6 +30,13 @@ CARRIED = 2.0
 TRUSTED = 1.5
 #: variance that is aimed at, as a share of the tolerance's
 AIM = 0.6
+#: error of a state's mean, in its standard deviations, that is aimed at, and the slices that keep it:
+#: spreads are then off by some 7 %
+STATE, SLICES = 0.1, 0.9
+#: and the one up to which a short run says how many particles are enough
+STATE_TRUSTED = 0.5
+#: the one above which a warning says so
+STATE_LARGE = 0.5
 #: error of the log evidence above which a warning says so
 LARGE = 1.0
 #: the same where the number of particles is given
@@ -43,15 +51,22 @@ FEW = 30.0
 MANY = 0.1
 
 
+class Errors(NamedTuple):
+    """Of a short run: of the log evidence, and of the states' means in their standard deviations."""
+
+    evidence: float
+    states: float
+
+
 def enough(
-    tried: Callable[[int, int], float], tolerance: float, slices: int, budget: int, keep: bool
+    tried: Callable[[int, int], Errors], tolerance: float, slices: int, budget: int, keep: bool
 ) -> int:
-    """Particles with which the error of the log evidence is likely to be as small as is asked.
+    """Particles with which the errors of log evidence and states are likely to be as small as is asked.
 
     Parameters
     ----------
     tried : callable
-        ``(particles, unit) -> error`` of a run with a random stream of its own.
+        ``(particles, unit) -> errors`` of a run with a random stream of its own.
     tolerance : float
     slices : int
         Times the elements of plates that are filtered separately, and the price of a particle.
@@ -69,13 +84,40 @@ def enough(
     most = affordable(slices, budget, keep)
     particles, unit = FIRST, 1
     while particles < most:
-        error = tried(particles, unit)
-        if error <= TRUSTED:
-            wanted = particles * (error / tolerance) ** 2 / AIM
+        errors = tried(particles, unit)
+        if errors.evidence <= TRUSTED and errors.states <= STATE_TRUSTED:
+            times = max(errors.evidence / tolerance, errors.states / STATE)
+            wanted = particles * times**2 / AIM
             doublings = math.ceil(math.log2(max(wanted / START, 1.0)))
             return min(START * 2**doublings, most)
         particles, unit = particles * TIMES, unit + 1
     return most
+
+
+def of_states(found: FilteredParticles, slices: Slices) -> dict[str, float]:
+    """By node, the error of its mean in standard deviations: what nine tenths of the slices keep.
+
+    Of a vector the worst number counts. States of finite nodes are told in parts of a half, which is the most
+    that an indicator spreads by. Nodes without noise follow from others, or stay, and are left out.
+    """
+    assert found.mean_errors is not None
+    by_name = {}
+    for name, errors in found.mean_errors.items():
+        node = slices.later[name]
+        if node.noiseless or not node.is_stochastic or not errors.size:
+            continue
+        if node.domain is None:
+            spread = found.std(name)
+        elif node.domain.labels is None:
+            spread = np.full(1, 0.5 * np.ptp(np.asarray(node.domain.numbers, dtype=float)))
+        else:
+            spread = np.full(1, 0.5)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            off = np.where(errors > 0, errors / spread, 0.0)
+        each = off.reshape(-1, math.prod(node.event_shape)) if node.domain is None else off
+        ranked = np.sort(each.reshape(-1, each.shape[-1]), axis=0)
+        by_name[name] = float(ranked[math.ceil(SLICES * len(ranked)) - 1].max())
+    return by_name
 
 
 def price(engine: Any, carried: float = 0.0) -> int:
@@ -113,6 +155,31 @@ def collapsed(filtered: FilteredParticles, engine: Any) -> str | None:
         f"{COLLAPSED:g} equally weighted ones (weight_ess; {own[at]:.1f} in slice {filtered.start + at}), so "
         f"means, spreads and the evidence rest on one of them: use more particles, {_looking(engine)}or less "
         "narrow noise"
+    )
+
+
+def unsteady(
+    found: FilteredParticles, slices: Slices, engine: Any, carried: float = 0.0
+) -> str | None:
+    """What is said where means of states are off by much of their own spread, or nobody can tell.
+
+    A number of particles that is given is taken as meant: few do for many a purpose.
+    """
+    assert found.counts is not None
+    if engine.particles is not None:
+        return None
+    errors = of_states(found, slices)
+    name = max(errors, key=errors.__getitem__, default="")
+    if not name or not errors[name] >= STATE_LARGE:
+        return None
+    if math.isinf(errors[name]):
+        said = f"cannot tell how far means of {name!r} are off (mcse is infinite)"
+    else:
+        said = f"leave means of {name!r} off by {errors[name]:.1f} of its standard deviation (mcse)"
+    return (
+        f"{int(found.counts.max())} particles {said} in a tenth of the slices or more, and its spread may be "
+        f"as far off; use {_more(found, engine, carried)}, {_looking(engine)}or a model in which single rows "
+        "say less"
     )
 
 
@@ -154,12 +221,22 @@ def uncertain(filtered: FilteredParticles, engine: Any, carried: float = 0.0) ->
     )
 
 
-def warn_of_errors(filtered: FilteredParticles, engine: Any, carried: float = 0.0) -> None:
-    """At most one warning: that slices rest on one particle, or that the evidence is not known well.
+def warn_of_errors(
+    filtered: FilteredParticles,
+    found: FilteredParticles,
+    slices: Slices,
+    engine: Any,
+    carried: float = 0.0,
+) -> None:
+    """At most one warning: that slices rest on one particle, or that evidence or states are not known well.
 
-    ``carried`` is what ``price`` takes.
+    ``found`` is the answer, if it is not the filter's own; ``carried`` is what ``price`` takes.
     """
-    text = collapsed(filtered, engine) or uncertain(filtered, engine, carried)
+    text = (
+        collapsed(filtered, engine)
+        or uncertain(filtered, engine, carried)
+        or unsteady(found, slices, engine, carried)
+    )
     if text is not None:
         warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
 

@@ -203,7 +203,7 @@ class IslandFilter(FilterEngine):
                 checkpoint.finish(found)
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
-        warn_of_errors(found, self.cloud)
+        warn_of_errors(found, found, problem.slices, self.cloud)
         return found
 
     def smooth(self, problem: SeriesProblem, seed: np.random.SeedSequence, **options: Any) -> Any:
