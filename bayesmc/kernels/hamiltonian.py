@@ -20,6 +20,7 @@ from bayesmc.kernels.hamiltonian_warmup import (
     MetricLearning,
     StepSize,
     first_steps,
+    fitting,
     windows,
 )
 from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, Transition, transition
@@ -63,7 +64,7 @@ class Hamiltonian(Kernel):
         Mean acceptance that the step's length is learnt for.
     max_depth : int
         Doublings of a trajectory, at most.
-    metric : "diagonal" or "dense"
+    metric : "auto", "diagonal" or "dense"
     match : str
         Why these nodes move so, for the table of kernels.
     threads : int
@@ -114,7 +115,7 @@ class Hamiltonian(Kernel):
         warmup: int | None = None,
         target_accept: float = 0.8,
         max_depth: int = 10,
-        metric: Metric = "diagonal",
+        metric: Metric = "auto",
         match: str = "",
         threads: int = 1,
         compiled: bool | None = None,
@@ -130,8 +131,8 @@ class Hamiltonian(Kernel):
         self.step_size = StepSize(target_accept)
         #: a warmup whose length is said learns for the acceptance that is said
         self.bends = Bends() if warmup is None else None
-        self.metric = MetricLearning(metric)
-        self.ends = windows(warmup)
+        self.metric = MetricLearning(fitting(metric, density.size))
+        self.ends, self.beginning = windows(warmup)
 
     def expect(self, steps: int, chains: int) -> None:
         """Gradients are machine code where so many steps pay for it."""
@@ -183,7 +184,7 @@ class Hamiltonian(Kernel):
             memory = self._first_steps(gradient, place, memory, rng, pooled=False)
         scale = Scale(memory["metric"]["root"])
         length = np.exp(memory["step"]["log"])
-        early = warmup and memory["windows"] < min(2, len(self.ends))
+        early = warmup and memory["windows"] < min(self.beginning + 1, len(self.ends))
         depth = min(self.max_depth, _EARLY) if early else self.max_depth
         memory = {**memory}
         found = self._moved(gradient, place, length, scale, rng, depth, values, memory)
@@ -297,20 +298,20 @@ class Hamiltonian(Kernel):
         rng: np.random.Generator,
     ) -> Memory:
         """The memory after a sweep of the warmup: the step always, the metric within windows."""
-        sweep, pooled = memory["sweep"] + 1, memory["windows"] > 0
+        sweep, pooled = memory["sweep"] + 1, memory["windows"] >= self.beginning
         memory = {**memory, "sweep": sweep}
         memory["step"] = self.step_size.learnt(memory["step"], acceptance, pooled)
         if memory["windows"] == len(self.ends):
             return memory
+        memory["metric"] = self.metric.learnt(memory["metric"], place.u, place.slope)
         if pooled:
-            memory["metric"] = self.metric.learnt(memory["metric"], place.u)
             memory = self._bent(memory)
         if sweep < self.ends[memory["windows"]]:
             return memory
-        if pooled:
-            memory["metric"] = self.metric.renewed(memory["metric"])
+        memory["metric"] = self.metric.renewed(memory["metric"])
         memory["windows"] += 1
-        return self._first_steps(gradient, place, memory, rng, pooled=True)
+        pooled = memory["windows"] >= self.beginning
+        return self._first_steps(gradient, place, memory, rng, pooled)
 
     def _bent(self, memory: Memory) -> Memory:
         """The memory with divergences of this window counted, and at its end a target nearer to 1, once."""

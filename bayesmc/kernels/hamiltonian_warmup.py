@@ -1,22 +1,26 @@
 """What Hamiltonian chains learn while they warm up: the length of a step, and a metric.
 
 The warmup has a beginning, in which every chain finds the mass with a step of its own; windows of doubling
-length, at the end of each of which the metric becomes the variance (or covariance) of that window's draws
-of all chains; and an end for the step alone. Metric and step are then common to all chains and frozen.
+length; and an end for the step alone. At the end of each window, those of the beginning included, the metric
+is renewed by that window's draws of all chains, and by the gradients there: the inverse metric is the
+geometric mean of the variance of the draws and the inverse variance of the gradients, which is that of a
+Normal density however small a part of it the chains have seen yet. Metric and step are then common to all
+chains and frozen.
 
-Nothing here has units: the first metric comes from the gradients where chains start, and is what later ones
-are shrunk towards, as Stan shrinks towards a thousandth of the identity.
+Nothing here has units: the first metric comes from the gradients where chains start.
 
 References
 ----------
 Hoffman and Gelman (2014), JMLR 15, sec. 3.2 (dual averaging) and algorithm 4 (the first step); Stan Reference
-Manual, version 2.36, chapter "MCMC Sampling", section "Automatic parameter tuning" (windows, regularisation).
+Manual, version 2.36, chapter "MCMC Sampling", section "Automatic parameter tuning" (windows); Seyboldt,
+Carlson and Carpenter (2026), Preconditioning Hamiltonian Monte Carlo by minimizing Fisher divergence, arXiv
+2603.18845 (sec. 3, diagonal and dense metrics).
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -29,25 +33,47 @@ _SHORT = (0.15, 0.10)
 _LEAST = 20
 #: the end of the beginning of a warmup of no known length, and how often it may double
 _OPEN, _DOUBLINGS = 20, 20
+#: the first window of the beginning, which double as well
+_FIRST = 10
 #: constants of dual averaging: shrinkage towards ten times the first step, early steps, decay
 _GAMMA, _EARLY, _KAPPA, _AHEAD = 0.05, 10.0, 0.75, math.log(10.0)
-#: trajectories that diverge by chance, their number and their share, at most; by how much the target of
-#: acceptance comes nearer to 1 where more do
-_DIVERGED, _NEARER = (2, 2e-3), 4.0
+#: share of trajectories that diverges by chance, at most; by how much the target of acceptance comes nearer to
+#: 1 where more do
+_DIVERGED, _NEARER = 1e-3, 4.0
 #: doublings (or halvings) in search of a first step
 _SEARCH = 60
-#: draws that the metric from before counts for, and the share of it that it is shrunk towards
-_PRIOR, _SHRUNK = 5.0, 1e-3
+#: draws of all chains below which a metric stays as it is
+_FEW = 10
+#: share of the mean variance of whitened numbers that is added to theirs, and to that of gradients, so that
+#: directions that no draw tells of stay as they are; and the ratio of variances up to which a direction is left
+#: so, for it may be chance
+_ADDED, _CHANCE = 1e-5, 2.0
 #: ratio of scales of the first metric to their median, at most
 _RANGE = 1e6
 #: variance between chains, over that within, above which they have not met
 _APART = 4.0
 
-Metric = Literal["diagonal", "dense"]
+Metric = Literal["auto", "diagonal", "dense"]
+#: numbers up to which a matrix is no dearer than most gradients
+_DENSE = 200
 
 
-def windows(warmup: int | None) -> tuple[int, ...]:
-    """Sweeps after which the metric is renewed; the first is where the beginning ends.
+def fitting(metric: Metric, size: int) -> Metric:
+    """The metric of so many numbers: dense up to some two hundred where nobody says which."""
+    if metric != "auto":
+        return metric
+    return "dense" if size <= _DENSE else "diagonal"
+
+
+class Windows(NamedTuple):
+    """Sweeps after which the metric is renewed; how many of these windows are of the beginning."""
+
+    ends: tuple[int, ...]
+    beginning: int
+
+
+def windows(warmup: int | None) -> Windows:
+    """The windows of a warmup.
 
     Parameters
     ----------
@@ -58,24 +84,31 @@ def windows(warmup: int | None) -> tuple[int, ...]:
     Examples
     --------
     >>> from bayesmc.kernels.hamiltonian_warmup import windows
-    >>> windows(1000), windows(100), windows(10), windows(None)[:4]
-    ((75, 100, 150, 250, 450, 950), (15, 90), (), (20, 40, 80, 160))
+    >>> windows(1000)
+    Windows(ends=(10, 30, 75, 100, 150, 250, 450, 950), beginning=3)
+    >>> windows(100), windows(10), windows(None).ends[:4]
+    (Windows(ends=(15, 90), beginning=1), Windows(ends=(), beginning=0), (10, 20, 40, 80))
     """
     if warmup is None:
-        return tuple(_OPEN << k for k in range(_DOUBLINGS))
+        return Windows((_FIRST, *(_OPEN << k for k in range(_DOUBLINGS))), 2)
     if warmup < _LEAST:
-        return ()
+        return Windows((), 0)
     fast, size, last = _FAST, _WINDOW, _END
     if fast + size + last > warmup:
         fast, last = (int(share * warmup) for share in _SHORT)
         size = warmup - fast - last
+    beginning, length = [0], _FIRST
+    while beginning[-1] + 2 * length <= fast:
+        beginning.append(beginning[-1] + length)
+        length *= 2
     limit = warmup - last
-    ends = [fast]
+    ends = [*beginning[1:], fast]
+    count = len(ends)
     while ends[-1] < limit:
         # a window that would leave the next one without room takes its place
         ends.append(limit if ends[-1] + 3 * size > limit else ends[-1] + size)
         size *= 2
-    return tuple(ends)
+    return Windows(tuple(ends), count)
 
 
 class StepSize:
@@ -164,7 +197,7 @@ class Bends:
     def target(self, memory: np.ndarray, target: float) -> float:
         """The acceptance that steps are learnt for after a window."""
         diverged, count = memory
-        if diverged < _DIVERGED[0] or diverged < _DIVERGED[1] * count:
+        if diverged <= _DIVERGED * count:
             return target
         return 1.0 - (1.0 - target) / _NEARER
 
@@ -203,15 +236,16 @@ def first_steps(
 
 
 class MetricLearning:
-    """Variances or covariances of the draws of all chains, window by window.
+    """Variances or covariances of the draws of all chains, and of the gradients there, window by window.
 
     A memory is a dict: ``first`` (the inverse metric from the start, shape (size,)), ``root`` (see
-    ``Scale``), and of the present window ``count``, ``mean`` (of each chain) and ``square`` (sums of squares,
-    or of products, about these).
+    ``Scale``), and of the present window ``count``, ``draws`` and ``slopes``, each with ``mean`` (of each
+    chain) and ``square`` (sums of squares about these; for a dense metric, of products).
 
     Parameters
     ----------
     kind : "diagonal" or "dense"
+        A dense one is diagonal all the same as long as no direction is told from chance.
     """
 
     def __init__(self, kind: Metric) -> None:
@@ -229,74 +263,107 @@ class MetricLearning:
         square = np.where(fine, square, middle)
         first = 1.0 / np.clip(square, middle / _RANGE**2, middle * _RANGE**2)
         root = np.sqrt(first)
-        return {
-            "first": first,
-            "root": root if self.kind == "diagonal" else np.diag(root),
-            **self._empty(*slope.shape),
-        }
+        return {"root": root, **self._empty(*slope.shape)}
 
-    def learnt(self, memory: dict[str, Any], u: np.ndarray) -> dict[str, Any]:
+    def learnt(self, memory: dict[str, Any], u: np.ndarray, slope: np.ndarray) -> dict[str, Any]:
         """The memory with one more draw of every chain (Welford's update)."""
-        if not np.isfinite(u).all():
+        if not np.isfinite(u).all() or not np.isfinite(slope).all():
             return memory
         count = memory["count"] + 1
-        away = u - memory["mean"]
-        mean = memory["mean"] + away / count
-        left = u - mean
-        square = (away * left).sum(axis=0) if self.kind == "diagonal" else away.T @ left
-        return {**memory, "count": count, "mean": mean, "square": memory["square"] + square}
+        products = self.kind == "dense"
+        draws = _with(memory["draws"], u, count, products)
+        slopes = _with(memory["slopes"], slope, count, products)
+        return {**memory, "count": count, "draws": draws, "slopes": slopes}
 
     def renewed(self, memory: dict[str, Any]) -> dict[str, Any]:
         """The memory with a metric from the window that ends, and a new window."""
-        found = self._spread(memory)
-        chains, size = memory["mean"].shape
-        count = chains * memory["count"]
-        if found is None:
-            return {**memory, **self._empty(chains, size)}
-        share = count / (count + _PRIOR)
-        found = share * found
-        prior = (1.0 - share) * _SHRUNK * memory["first"]
-        root = memory["root"]
-        if self.kind == "diagonal":
-            root = np.sqrt(found + prior)
-        else:
+        chains, size = memory["draws"]["mean"].shape
+        empty, count = self._empty(chains, size), chains * memory["count"]
+        if memory["count"] < 2 or count < _FEW:
+            return {**memory, **empty}
+        met = _met(memory["draws"], memory["count"])
+        draws, slopes = (_spread(memory[n], memory["count"], met) for n in ("draws", "slopes"))
+        before = memory["root"]
+        own = np.square(before) if before.ndim == 1 else np.square(before).sum(axis=1)
+        apart = [x if x.ndim == 1 else np.diagonal(x) for x in (draws, slopes)]
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            told = np.sqrt(apart[0] / apart[1])
+        scale = np.sqrt(np.where(np.isfinite(told) & (told > 0), told, own))
+        root = scale
+        if self.kind == "dense":
             try:
-                root = _root_of(found + np.diag(prior))
-            except np.linalg.LinAlgError:  # rounding: keep what was there
+                whitened = _whitened(draws, slopes, scale)
+                root = scale if whitened is None else scale[:, None] * whitened
+            except np.linalg.LinAlgError:
                 pass
-        if not np.isfinite(root).all():
-            root = memory["root"]
-        return {**memory, "root": root, **self._empty(chains, size)}
-
-    def _spread(self, memory: dict[str, Any]) -> np.ndarray | None:
-        """Variances or covariances of the window's draws; None of too few.
-
-        Chains that have not met, as where they name components differently, say nothing of how far a step may
-        go: what lies between them counts only where it is not far more than what lies within.
-        """
-        count, mean = memory["count"], memory["mean"]
-        chains = len(mean)
-        if count < 2:
-            return None
-        within = memory["square"] / (chains * (count - 1))
-        if chains == 1:
-            return np.asarray(within)
-        away = mean - mean.mean(axis=0)
-        inside = within if within.ndim == 1 else np.diagonal(within)
-        met = np.square(away).sum(axis=0) <= _APART * (chains - 1) * inside
-        away = away * met
-        between = np.square(away).sum(axis=0) if within.ndim == 1 else away.T @ away
-        return np.asarray((1.0 - 1.0 / count) * within + between / (chains - 1))
+        return {**memory, "root": root if np.isfinite(root).all() else before, **empty}
 
     def _empty(self, chains: int, size: int) -> dict[str, Any]:
-        shape = (size,) if self.kind == "diagonal" else (size, size)
-        return {"count": 0, "mean": np.zeros((chains, size)), "square": np.zeros(shape)}
+        def sums(*shape: int) -> dict[str, np.ndarray]:
+            return {"mean": np.zeros((chains, size)), "square": np.zeros(shape)}
+
+        shape = (size, size) if self.kind == "dense" else (size,)
+        return {"count": 0, "draws": sums(*shape), "slopes": sums(*shape)}
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _root_of(cov: np.ndarray) -> np.ndarray:
-    """Cholesky factor of a covariance, taken of the correlation, so that units do not matter."""
-    scale = np.sqrt(np.diagonal(cov))
-    return scale[:, None] * np.linalg.cholesky(cov / np.outer(scale, scale))
+def _with(
+    sums: dict[str, np.ndarray], x: np.ndarray, count: int, products: bool
+) -> dict[str, np.ndarray]:
+    """Means of each chain and sums of squares (or of products) about them, with the count-th ``x``."""
+    away = x - sums["mean"]
+    mean = sums["mean"] + away / count
+    left = x - mean
+    more = away.T @ left if products else (away * left).sum(axis=0)
+    return {"mean": mean, "square": sums["square"] + more}
+
+
+def _within(sums: dict[str, np.ndarray], count: int) -> np.ndarray:
+    """Variances (or covariances) within chains."""
+    return sums["square"] / (len(sums["mean"]) * (count - 1))
+
+
+def _met(sums: dict[str, np.ndarray], count: int) -> np.ndarray:
+    """Which numbers have chains that have met, shape (size,).
+
+    Chains that have not, as where they name components differently, say nothing of how far a step may go.
+    """
+    within = _within(sums, count)
+    inside = within if within.ndim == 1 else np.diagonal(within)
+    mean = sums["mean"]
+    between = np.square(mean - mean.mean(axis=0)).sum(axis=0)
+    return np.asarray(between <= _APART * (len(mean) - 1) * inside)
+
+
+def _spread(sums: dict[str, np.ndarray], count: int, met: np.ndarray) -> np.ndarray:
+    """Variances or covariances of a window's draws, those between chains counted where these have met."""
+    within, mean = _within(sums, count), sums["mean"]
+    chains = len(mean)
+    if chains == 1:
+        return np.asarray(within)
+    away = (mean - mean.mean(axis=0)) * met
+    between = np.square(away).sum(axis=0) if within.ndim == 1 else away.T @ away
+    return np.asarray((1.0 - 1.0 / count) * within + between / (chains - 1))
+
+
+def _whitened(draws: np.ndarray, slopes: np.ndarray, scale: np.ndarray) -> np.ndarray | None:
+    """A root of the inverse metric of numbers in units of ``scale``, symmetric; None of the identity.
+
+    The geometric mean of two matrices A and C is ``A (A^-1 C)^(1/2)``; here A is the inverse of B, the
+    covariance of gradients: ``B^(-1/2) (B^(1/2) C B^(1/2))^(1/2) B^(-1/2)``.
+    """
+    units = np.outer(scale, scale)
+    draws, slopes = draws / units, slopes * units
+    added = _ADDED * float(np.trace(draws)) / len(scale) * np.eye(len(scale))
+    values, vectors = np.linalg.eigh(slopes + added)
+    half = (vectors * np.sqrt(values)) @ vectors.T
+    back = (vectors / np.sqrt(values)) @ vectors.T
+    values, vectors = np.linalg.eigh(half @ (draws + added) @ half)
+    middle = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+    values, vectors = np.linalg.eigh(back @ middle @ back)
+    told = np.abs(np.log(np.maximum(values, 1e-300))) > math.log(_CHANCE)
+    if not told.any():
+        return None
+    return np.asarray((vectors * np.sqrt(np.where(told, values, 1.0))) @ vectors.T)

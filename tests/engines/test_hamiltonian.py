@@ -117,7 +117,7 @@ def test_what_nothing_depends_on_is_drawn_forward() -> None:
     table = {row.node: row for row in bmc.explain(net, LINE, engine=posterior.engine).table}
     assert table["later"].kernel == "forward"
     assert table["a"].kernel == "Hamiltonian"
-    assert "all 2 free numbers, diagonal metric" in table["a"].why
+    assert "all 2 free numbers, dense metric" in table["a"].why
     assert_matches(posterior, exact(net, LINE), alpha=1e-5)
 
 
@@ -218,7 +218,7 @@ def test_thinned_draws_know_all_their_trajectories() -> None:
         ({"target_accept": 1.0}, "target_accept is a share between 0 and 1"),
         ({"target_accept": "high"}, "target_accept is a share between 0 and 1"),
         ({"max_depth": 0}, "max_depth is a whole number"),
-        ({"metric": "full"}, 'metric is "diagonal" or "dense"'),
+        ({"metric": "full"}, 'metric is "auto", "diagonal" or "dense"'),
         ({"draws": -1}, "draws is a whole number"),
     ],
 )

@@ -127,6 +127,30 @@ def test_dense_metric_of_correlated_numbers() -> None:
     assert np.all(np.abs(pooled.mean(axis=0)) < LIMIT * errors)
 
 
+@pytest.mark.parametrize("seen", [1.0, 1e-4])
+def test_a_metric_needs_few_draws_and_no_exploring(seen: float) -> None:
+    """Fifteen draws of twelve numbers, far from all that there is to see: gradients tell the rest."""
+    rng = np.random.default_rng(SHIFT)
+    cov = equicorrelated(12, 0.99, np.logspace(-3, 3, 12))
+    precision, root = np.linalg.inv(cov), np.linalg.cholesky(cov)
+    learning = MetricLearning("dense")
+    memory = learning.start(rng.standard_normal((1, 12)) @ np.linalg.inv(root))
+    draws = seen * rng.standard_normal((15, 1, 12)) @ root.T + 3.0 * root.sum(axis=1)
+    for u in draws:
+        memory = learning.learnt(memory, u, -u @ precision)
+    found = learning.renewed(memory)["root"]
+    least, largest = _worst_ratio(found @ found.T, root)
+    assert 0.3 < least and largest < 3.0
+    own = np.cov(draws[:, 0].T)  # the negative control: what draws alone tell
+    assert _worst_ratio(own, root)[0] < 0.1
+
+
+def _worst_ratio(cov: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """The least and the largest ratio of variances in any direction."""
+    back = np.linalg.inv(root)
+    return np.linalg.eigvalsh(back @ cov @ back.T)[[0, -1]]
+
+
 @pytest.mark.parametrize("metric", ["diagonal", "dense"])
 def test_units_do_not_matter(metric: Any) -> None:
     """The same random numbers make the same draws in any units that are powers of two."""
@@ -178,21 +202,23 @@ def test_chains_in_two_modes(metric: Any, apart: float, monkeypatch: pytest.Monk
     kernel = Hamiltonian(OfNumbers(both, 3), warmup=200, metric=metric)
     _, memory = warmed(kernel, start + rng.standard_normal((4, 3)), 200, rng)
     root = memory["metric"]["root"]
-    found = root if metric == "diagonal" else np.sqrt(np.diagonal(root @ root.T))
+    found = root if root.ndim == 1 else np.sqrt(np.diagonal(root @ root.T))
     assert bool(np.all(np.abs(np.log(found)) < 0.5)) == np.isfinite(apart)
 
 
 def test_windows() -> None:
-    assert windows(1000) == (75, 100, 150, 250, 450, 950)  # Stan Reference Manual
-    assert windows(500) == (75, 100, 150, 250, 450)
-    assert windows(150) == (75, 100)
-    assert windows(100) == (15, 90)
-    assert windows(19) == ()
+    """From the end of the beginning on those of the Stan Reference Manual."""
+    assert windows(1000) == ((10, 30, 75, 100, 150, 250, 450, 950), 3)
+    assert windows(500) == ((10, 30, 75, 100, 150, 250, 450), 3)
+    assert windows(150) == ((10, 30, 75, 100), 3)
+    assert windows(100) == ((15, 90), 1)
+    assert windows(19) == ((), 0)
     for warmup in range(20, 3000, 7):
-        ends = windows(warmup)
+        ends, beginning = windows(warmup)
         assert list(ends) == sorted(set(ends))
         assert ends[-1] == warmup - (50 if warmup >= 150 else int(0.1 * warmup))
-    assert windows(None)[:6] == (20, 40, 80, 160, 320, 640)
+        assert ends[beginning - 1] == (75 if warmup >= 150 else int(0.15 * warmup))
+    assert windows(None).ends[:6] == (10, 20, 40, 80, 160, 320) and windows(None).beginning == 2
 
 
 @pytest.mark.parametrize("pooled", [False, True])

@@ -17,7 +17,7 @@ from bayesmc.engines.mcmc.jointly import continuous, density_of, jumping, summed
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
-from bayesmc.kernels.hamiltonian_warmup import Metric
+from bayesmc.kernels.hamiltonian_warmup import Metric, fitting
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.rescaled import rescaled_kernels
 from bayesmc.kernels.summed_out import SummedOut
@@ -29,7 +29,7 @@ from bayesmc.structure.target import target_of
 #: sweeps of which one moves scales with what they scale: a trajectory in machine code costs far less
 _RESCALED = 4
 _JUMPS = "the density jumps where it is compared, which no gradient sees"
-_METRICS = ("diagonal", "dense")
+_METRICS = ("auto", "diagonal", "dense")
 
 
 @dataclass(frozen=True, repr=False)
@@ -65,9 +65,10 @@ class HamiltonianMonteCarlo(ChainEngine):
         Whether finite nodes are summed out of the density where they can be, and drawn given the numbers:
         labels of a plate element by element, others by their joint states, at most 512 (`bmc.log_density`).
         Labels and numbers that cling to each other mix so. Without it they are drawn in turn.
-    metric : "diagonal" or "dense"
-        Whether scales of all numbers are learnt, or their correlations, too: dense where a few hundred
-        numbers at most are strongly correlated.
+    metric : "auto", "diagonal" or "dense"
+        Whether scales of all numbers are learnt, or their correlations, too. Dense up to 200 numbers where
+        it is left open: by the draws and the gradients there correlations are learnt fast, and more numbers
+        make each step dearer.
     threads : int
         Threads that share the chains where trajectories are machine code; the answer is the same.
     debug : bool
@@ -112,7 +113,7 @@ class HamiltonianMonteCarlo(ChainEngine):
     target_accept: float = 0.8
     max_depth: int = 10
     marginalize: bool = False
-    metric: Metric = "diagonal"
+    metric: Metric = "auto"
     threads: int = field(default=1, compare=False)
     debug: bool = False
     ess: float = 1000
@@ -137,7 +138,9 @@ class HamiltonianMonteCarlo(ChainEngine):
                 f"{what}(marginalize={self.marginalize!r}): marginalize is True or False"
             )
         if self.metric not in _METRICS:
-            raise ValueError(f'{what}(metric={self.metric!r}): metric is "diagonal" or "dense"')
+            raise ValueError(
+                f'{what}(metric={self.metric!r}): metric is "auto", "diagonal" or "dense"'
+            )
 
     def refusal(self, problem: Problem) -> str | None:
         return refused(
@@ -211,7 +214,7 @@ class HamiltonianMonteCarlo(ChainEngine):
             target_accept=self.target_accept,
             max_depth=self.max_depth,
             metric=self.metric,
-            match=f"with all {density.size} free numbers, {self.metric} metric",
+            match=f"with all {density.size} free numbers, {fitting(self.metric, density.size)} metric",
             threads=self.threads,
             debug=self.debug,
         )

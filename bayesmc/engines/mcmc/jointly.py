@@ -9,7 +9,7 @@ from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import ANYHOW, How
 from bayesmc.kernels.hamiltonian import Hamiltonian
-from bayesmc.kernels.hamiltonian_warmup import Metric
+from bayesmc.kernels.hamiltonian_warmup import fitting
 from bayesmc.network import Problem
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.jumps import jumps
@@ -17,7 +17,7 @@ from bayesmc.structure.summing import components
 from bayesmc.structure.target import Target, target_of
 from bayesmc.structure.unconstrained import unconstrained_density
 
-#: numbers up to which their covariance is learnt, and not their scales alone
+#: numbers of nodes that move jointly, at most
 DENSE = 64
 #: numbers of like nodes from which on slices move them as one (60 slices of a volatility: 5 times better)
 CROWD = 32
@@ -129,7 +129,7 @@ def trajectories_of(
         joined = _joined(target, group, [n for n in closed if n not in alone])
         density = _smooth(problem, joined) or _smooth(problem, group)
         if density is not None:
-            metric: Metric = "dense" if density.size <= DENSE else "diagonal"
+            metric = fitting("auto", density.size)
             match = f"{density.size} free numbers jointly, {metric} metric"
             kernels.append(
                 Hamiltonian(

@@ -39,8 +39,8 @@ _LOST = 5.0
 #: how far from zero free numbers of other starts are, at most; what some steps must gain where paths of
 #: starts that may be lost are followed further
 _NEAR, _LITTLE = np.array([0.5, 2.0, 8.0]), 1.0
-#: free numbers beyond which the paths of all starts take longer than they save
-_LARGEST = 2000
+#: free numbers of all starts beyond which their paths take longer than they save
+_LARGEST = 150_000
 
 
 def uphill(target: Target, values: Values, rng: np.random.Generator) -> Values:
@@ -65,11 +65,11 @@ def uphill(target: Target, values: Values, rng: np.random.Generator) -> Values:
         density = _density(target)
     except BayesmcError:
         return values
-    if not 0 < density.size <= _LARGEST:
-        return values
     hidden = {n: v for n, v in values.items() if n in target.chain}
     inside = {*hidden, *target.links}
     rows = len(next(iter(hidden.values())))
+    if not 0 < rows * density.size <= _LARGEST:
+        return values
     free = np.array(density.unconstrain(values), dtype=float)
     margin = _BESIDES + _EACH * density.size
     points, logs = _paths(density, free, values, margin)
