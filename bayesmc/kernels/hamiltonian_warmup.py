@@ -37,16 +37,16 @@ _OPEN, _DOUBLINGS = 20, 20
 _FIRST = 10
 #: constants of dual averaging: shrinkage towards ten times the first step, early steps, decay
 _GAMMA, _EARLY, _KAPPA, _AHEAD = 0.05, 10.0, 0.75, math.log(10.0)
-#: share of trajectories that diverges by chance, at most; by how much the target of acceptance comes nearer to
-#: 1 where more do
+#: share of trajectories that diverges by chance, at most; by how much the target of acceptance comes nearer
+#: to 1 where more do
 _DIVERGED, _NEARER = 1e-3, 4.0
 #: doublings (or halvings) in search of a first step
 _SEARCH = 60
 #: draws of all chains below which a metric stays as it is
 _FEW = 10
 #: share of the mean variance of whitened numbers that is added to theirs, and to that of gradients, so that
-#: directions that no draw tells of stay as they are; and the ratio of variances up to which a direction is left
-#: so, for it may be chance
+#: directions that no draw tells of stay as they are; and the ratio of variances up to which a direction is
+#: left so, for it may be chance
 _ADDED, _CHANCE = 1e-5, 2.0
 #: ratio of scales of the first metric to their median, at most
 _RANGE = 1e6
