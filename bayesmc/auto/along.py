@@ -55,10 +55,9 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
     if any(isinstance(kernel, BlockWalk) for kernel in plan.kernels):  # it may find another mode
         return None
     sizes = {n: math.prod(model[n].value_shape) for n in moved if n not in labels}
-    of_slices = (Slice, FactorSlice, Hamiltonian) if labels else (Slice, FactorSlice)
-    slow = sum(
-        sizes.get(n, 0) for n in {n for k in plan.kernels if _is(k, of_slices) for n in k.names}
-    )
+    slices = [k for k in plan.kernels if _is(k, (Slice, FactorSlice))]
+    blocks = [k for k in plan.kernels if isinstance(k, Hamiltonian)] if labels or slices else []
+    slow = sum(sizes.get(n, 0) for n in {n for k in (*slices, *blocks) for n in k.names})
     total = sum(sizes.values())
     few = 0 if labels else CROWD
     if not few < slow or slow < _MOST_OF * total or total > _LARGEST:

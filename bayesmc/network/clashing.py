@@ -65,7 +65,11 @@ def sizes_in(message: str, batch: Shape) -> set[int]:
 
 
 def picked_by_row(
-    plates: Mapping[str, int], vectors: Mapping[str, Shape], batch: Shape, message: str
+    plates: Mapping[str, int],
+    vectors: Mapping[str, Shape],
+    batch: Shape,
+    message: str,
+    elsewhere: Mapping[str, tuple[tuple[str, ...], Shape]] | None = None,
 ) -> str | None:
     """What to write where an array over plates has picked components of a vector parent, and adds an axis.
 
@@ -78,6 +82,8 @@ def picked_by_row(
     batch : tuple of int
     message : str
         It tells the shape that does not fit.
+    elsewhere : mapping, optional
+        Parent whose elements are of other plates -> those, and the shape of an element.
 
     Examples
     --------
@@ -86,6 +92,7 @@ def picked_by_row(
     "its parent 'beta' is a vector and arrives as (*batch, 1, 3)"
     """
     over = tuple(plates.values())
+    others = [_of_elements(n, *found, plates) for n, found in (elsewhere or {}).items()]
     for shape in _shapes_in(message):
         for name, arrives in vectors.items():
             own, rest = (*batch, *arrives[:-1]), shape[len(batch) :]
@@ -109,8 +116,25 @@ def picked_by_row(
                 f"{' and '.join(map(repr, plates))} keeps the axes of both, shape {shape}. Write "
                 f"{name}[..., {each}, k] for each element's component k, {name}[..., 0] for the first "
                 f"component of all{by_plate if max(arrives[:-1]) == 1 else ''}"
+                f"{''.join(f'. Or it is {text}' for text in others)}"
             )
+        if others and over and shape == (*batch, *(1 for _ in over), *over):
+            return " or ".join(others)
     return None
+
+
+def _of_elements(name: str, own: tuple[str, ...], event: Shape, plates: Iterable[str]) -> str:
+    """What to write for the elements of a parent of other plates, or for their components."""
+    zeros = ", ".join("0" for _ in plates)
+    told = (
+        f"its parent {name!r}, whose {'vectors' if event else 'elements'} are of "
+        f"{' and '.join(map(repr, own))}: {name}.array has an axis of one for "
+        f"{' and '.join(map(repr, plates))} before theirs, so write"
+    )
+    if event:
+        index = ", ".join([*own, "k"])
+        return f"{told} {name}.array[..., {zeros}, {index}] for component k of each row's element"
+    return f"{told} np.vecdot(X, {name}.array) for a sum over them with weights X (np.matvec adds an axis)"
 
 
 def sizes_beyond(shape: Shape, target: Shape) -> set[int]:

@@ -195,13 +195,17 @@ def _fault_alone(model: Model, node: CompiledNode) -> BayesmcError | None:
 def _picked_by_row(model: Model, node: CompiledNode, message: str) -> str | None:
     """What to write where components of a vector parent are picked beside the plates."""
     sizes = dict(zip(node.plates, node.plate_shape, strict=True))
-    vectors = {}
+    vectors, elsewhere = {}, {}
     for parent, link in node.links:
-        if len(model.nodes[parent].event_shape) == 1 and sizes and not link.foreign:
-            above = model.nodes[parent]
+        above = model.nodes[parent]
+        if len(above.event_shape) > 1 or not sizes:
+            continue
+        if link.foreign:
+            elsewhere[parent] = above.plates, above.event_shape
+        elif above.event_shape:
             own = (n if p in above.plates else 1 for p, n in sizes.items())
             vectors[parent] = (*own, *above.event_shape)
-    return picked_by_row(sizes, vectors, model.probe_shape, message)
+    return picked_by_row(sizes, vectors, model.probe_shape, message, elsewhere)
 
 
 def _is_plain(error: BayesmcError) -> bool:

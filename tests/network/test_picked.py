@@ -163,6 +163,44 @@ def test_a_component_beside_the_plate_is_told_with_the_index_that_picks_it(funct
     assert "beta[..., np.arange(7), k]" in fault(function, plates="row")
 
 
+REGION, YEAR = np.array([0, 0, 1, 1]), np.array([0, 2, 0, 2])
+
+
+def of_regions(function, vector=False):
+    net = bmc.BayesNet(plates={"region": 2, "row": 4})
+    net.add("curve", bmc.MvNormal(np.zeros(3), np.eye(3)), plates="region")
+    net.add("effect", bmc.Normal(0.0, 1.0), plates="region")
+    net.add("sd", bmc.Dirichlet(np.ones(5)) if vector else bmc.Gamma(1.0, 1.0))
+    net.add("y", function, plates="row")
+    return net
+
+
+@pytest.mark.parametrize("vector", [False, True])
+def test_elements_of_another_plate_are_told_with_the_axis_before_them(vector):
+    """Vectors, also where another parent is a vector as well, and may be the one; and numbers."""
+    scale = (lambda sd: sd[..., 0]) if vector else (lambda sd: sd)
+    functions = {
+        "curve.array[..., 0, region, k]": lambda curve, sd: bmc.Normal(
+            scale(sd) + curve.array[..., REGION, YEAR], 1.0
+        ),
+        "np.vecdot(X, effect.array)": lambda effect, sd: bmc.Normal(
+            scale(sd) + np.matvec(np.ones((4, 2)), effect.array), 1.0
+        ),
+    }
+    for words, function in functions.items():
+        with pytest.raises((BroadcastError, ShapeError)) as error:
+            of_regions(function, vector).sample(3, rng=0)
+        assert words in str(error.value)
+
+
+def test_what_they_are_told_to_write_works():
+    for function in (
+        lambda curve: bmc.Normal(curve.array[..., 0, REGION, YEAR], 1.0),
+        lambda effect: bmc.Normal(np.vecdot(np.ones((4, 2)), effect.array), 1.0),
+    ):
+        assert of_regions(function).sample(3, rng=0)["y"].shape == (3, 4)
+
+
 def test_a_component_that_a_node_picks_is_told_to_be_a_plate():
     three = bmc.Categorical(np.ones(3) / 3)
     told = fault(lambda beta, z: bmc.Normal(beta[..., 0, z], 1.0), node=three)
