@@ -92,6 +92,15 @@ def row_logs(term: Term, values: Values, rows: int) -> np.ndarray:
     return np.concatenate(halves)
 
 
+def data_logs(target: Target, values: Values, rows: int) -> np.ndarray:
+    """Log densities of what no chain moves, shape ``(rows,)``: of the data, and of potentials."""
+    found = np.zeros(rows)
+    for term in target.terms.values():
+        if term.name not in target.chain:
+            found += row_logs(term, values, rows).reshape(rows, -1).sum(axis=1)
+    return found
+
+
 def largest_term(target: Target) -> int:
     """Numbers of the largest value or term of one row."""
     values = [math.prod(target.model[n].value_shape) for n in (*target.chain, *target.links)]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.forward import fast_steps
+from bayesmc.engines.mcmc.short_runs import by_short_runs, has_labels
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.engines.mcmc.uphill import uphill
 from bayesmc.errors import ModelError, UnsupportedError
@@ -114,9 +115,16 @@ class SweepSampler:
         """A state of ``rows`` rows for ``chains`` chains."""
         given = self.given_rows(rows)
         starts = rows if given or not self.superchains else self.superchains
-        values = start_states(self.target, starts, rng, given)
-        if self.climbs and not given:
-            values = uphill(self.target, values, rng)
+
+        def draw(count: int) -> Values:
+            values = start_states(self.target, count, rng, given)
+            return uphill(self.target, values, rng) if self.climbs and not given else values
+
+        values = (
+            by_short_runs(self.target, self.kernels, draw, starts, rng)
+            if not given and has_labels(self.target)
+            else draw(starts)
+        )
         inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
         if starts < rows:
             inside = {n: np.repeat(v, rows // starts, axis=0) for n, v in inside.items()}

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesmc.engines.mcmc.climbing import row_logs
+from bayesmc.engines.mcmc.climbing import data_logs
 from bayesmc.engines.mcmc.jointly import continuous, density_of
 from bayesmc.errors import BayesmcError
 from bayesmc.structure.compiled_density import in_machine_code
@@ -163,11 +163,7 @@ def _of_data(
     rows = points.shape[1]
     state = {**values, **density.constrain(points[-1], values)}
     target.refresh(state, target.chain)
-    found = np.zeros(rows)
-    for term in target.terms.values():
-        if term.name not in target.chain:
-            found += row_logs(term, state, rows).reshape(rows, -1).sum(axis=1)
-    return found
+    return data_logs(target, state, rows)
 
 
 def _paths(
