@@ -294,7 +294,7 @@ def test_particles_grow_until_states_are_known() -> None:
 
 def test_by_the_evidence_alone_they_are_too_few(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control."""
-    monkeypatch.setattr("bayesmc.engines.particles.filter.of_states", lambda *given: {})
+    monkeypatch.setattr("bayesmc.engines.particles.enough.of_states", lambda *given: {})
     found = [states_off(session.seed() + k) for k in range(4)]
     assert max(mean for mean, _ in found) > 0.3 or max(spread for _, spread in found) > 0.2
 

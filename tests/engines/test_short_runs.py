@@ -98,7 +98,7 @@ def test_runs_that_fail_leave_the_starts_as_they_are() -> None:
     _, y = rows(0)
     problem = pose(mixture(), {"y": y})
     target = target_of(problem)
-    kernels = bmc.Gibbs().sampler(problem).kernels
+    kernels: list[Any] = bmc.Gibbs().sampler(problem).kernels
     drawn = []
 
     def draw(count: int) -> Any:
@@ -111,7 +111,8 @@ def test_runs_that_fail_leave_the_starts_as_they_are() -> None:
         def start(self, values: Any, chains: int) -> Any:
             raise DensityError("no density")
 
-    found = by_short_runs(target, [*kernels, Broken()], draw, 3, np.random.default_rng(0))
+    broken: Any = Broken()
+    found = by_short_runs(target, [*kernels, broken], draw, 3, np.random.default_rng(0))
     np.testing.assert_array_equal(found["mu"], draw(6)["mu"][:3])
     drawn.clear()
     many = short_runs._ROWS

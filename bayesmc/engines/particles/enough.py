@@ -54,8 +54,8 @@ MANY = 0.1
 class Errors(NamedTuple):
     """Of a short run: of the log evidence, and of the states' means in their standard deviations."""
 
-    evidence: float
-    states: float
+    evidence: float = math.inf
+    states: float = math.inf
 
 
 def enough(
@@ -118,6 +118,12 @@ def of_states(found: FilteredParticles, slices: Slices) -> dict[str, float]:
         ranked = np.sort(each.reshape(-1, each.shape[-1]), axis=0)
         by_name[name] = float(ranked[math.ceil(SLICES * len(ranked)) - 1].max())
     return by_name
+
+
+def errors_of(found: FilteredParticles, slices: Slices) -> Errors:
+    """Those of a run: the worst of all series, and of all nodes."""
+    states = max(of_states(found, slices).values(), default=0.0)
+    return Errors(float(np.max(found.log_marginal_likelihood_mcse)), states)
 
 
 def price(engine: Any, carried: float = 0.0) -> int:

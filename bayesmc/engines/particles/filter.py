@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
@@ -16,16 +15,7 @@ from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief, absorbed, bound, warn_of_a_lonely_step
 from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.delaying import ahead_told, not_delayed, read_delay
-from bayesmc.engines.particles.enough import (
-    BUDGET,
-    START,
-    TOLERANCE,
-    Errors,
-    enough,
-    of_states,
-    price,
-    warn_of_errors,
-)
+from bayesmc.engines.particles.enough import BUDGET, START, TOLERANCE, warn_of_errors
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.lags import by_lag
@@ -52,11 +42,11 @@ from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
 from bayesmc.engines.particles.run import filtered_by
-from bayesmc.engines.particles.runs import run_of
+from bayesmc.engines.particles.runs import run_of, with_enough
 from bayesmc.engines.particles.smoothing import Backwards, backwards
 from bayesmc.engines.refusals import check_keep, no_past_of_objects, not_with_objects
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import DegeneracyError, UnsupportedError
+from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.resampling import Adaptive, checked, scheme_of
 from bayesmc.results import RunFile
@@ -325,7 +315,7 @@ class ParticleFilter(FilterEngine):
         own: ParticleFilter = marginal.asking(self, "smooth" if lag is None else "fixed-lag")
         if not own._integrates(problem):
             warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
-        sized = own._sized(own._enough(problem, seed, lag is None, progress))
+        sized = with_enough(own, problem, seed, lag is None, progress)
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, False, queries or {}, progress)
         else:
@@ -429,30 +419,6 @@ class ParticleFilter(FilterEngine):
         found = object.__new__(type(self))
         found.__dict__.update(self.__dict__, particles=particles)
         return found
-
-    def _enough(
-        self,
-        problem: SeriesProblem,
-        seed: np.random.SeedSequence,
-        keep: bool,
-        progress: bool | None,
-    ) -> int:
-        """How many particles the error of the evidence needs, by runs whose draws do not come back."""
-        if self.particles is not None or self.adapt is not None:
-            return START
-
-        def tried(particles: int, unit: int) -> Errors:
-            try:
-                found = self._sized(particles)._passed(problem, seed, False, {}, progress, unit)
-            except DegeneracyError:
-                return Errors(math.inf, math.inf)
-            states = max(of_states(found, problem.slices).values(), default=0.0)
-            return Errors(float(np.max(found.log_marginal_likelihood_mcse)), states)
-
-        sizes = problem.slices.first.sizes
-        slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
-        slices *= price(self, marginal.numbers_carried(self, problem))
-        return enough(tried, self.tolerance, slices, self.budget, keep)
 
     def _proposals(self, slices: Slices) -> SliceProposals:
         assert not isinstance(self.proposal, str)
