@@ -1,8 +1,9 @@
 """Where trajectories of all numbers together are better than a sweep over them, told without trying.
 
 A sweep moves a plate's elements by slices at once, each by itself: what they share crawls. Where many numbers
-are moved so, and they are most of all, trajectories in machine code take less for an effective draw (1.5 to
-13 times less on the models that it was tried on); in NumPy they need not. Their steps are shorter than the
+are moved so, or by blocks along trajectories beside slices, and they are most of all, trajectories in machine
+code take less for an effective draw (1.5 to 13 times less on the models that it was tried on); in NumPy they
+need not. Their steps are shorter than the
 engine's own: hardly slower there, and fewer trajectories diverge.
 """
 
