@@ -17,7 +17,7 @@ from bayesmc.errors import BayesmcError, EvidenceError, UnsupportedError
 from bayesmc.expression import elementwise, ordered
 from bayesmc.network import pose
 from bayesmc.passes import alike
-from bayesmc.structure import free_nodes, free_terms, unconstrained
+from bayesmc.structure import free_nodes, free_terms, unconstrained, unconstrained_check
 from bayesmc.structure.free_terms import Elements
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
@@ -459,3 +459,28 @@ def test_values_outside_their_support_are_refused(outside: Any) -> None:
     net.add("y", lambda x: bmc.Normal(x, 1.0))
     with pytest.raises(EvidenceError, match="that of 'x' is outside, or at its edge"):
         bmc.log_density(net, {"y": 1.0}).unconstrain({"x": outside})
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+def test_what_differs_where_nobody_gets_counts_for_nothing(everywhere: bool) -> None:
+    """Rounding that a coarse solver blows up far out; a fault shows where the density is high, too."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda a: bmc.Normal(50.0 * a, 0.01))
+    plain, refused = unconstrained_check._check_sum, 0
+
+    def doubted(density: UnconstrainedDensity, parts: Any, u: np.ndarray, values: Values) -> None:
+        nonlocal refused
+        plain(density, parts, u, values)
+        if everywhere or density.value(u, values) < -1e4:
+            refused += 1
+            raise UnsupportedError("the log density is off")
+
+    target = target_of(pose(net, {"y": 0.0}))
+    with mock.patch.object(unconstrained_check, "_check_sum", doubted):
+        if everywhere:
+            with pytest.raises(UnsupportedError, match="the log density is off"):
+                unconstrained_density(target)
+        else:
+            assert unconstrained_density(target).size == 1
+    assert refused > 1
