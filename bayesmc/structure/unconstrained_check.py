@@ -119,9 +119,9 @@ def hold_against_model(
         if not told.all() and log > -np.inf:
             is_positive = True
             told |= density.is_told(u, values)
-    for log, error in doubts:
+    for log, doubt in doubts:
         if not log < highest - _NOWHERE_NEAR:
-            raise error
+            raise doubt
     for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
             raise UnsupportedError(

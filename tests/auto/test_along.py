@@ -59,6 +59,29 @@ def test_others_are_swept_over(options: dict[str, Any]) -> None:
     assert chosen(*litters(**options)) is None
 
 
+def splines(knots: int, rows: int = 60) -> Any:
+    """Mean and log scale on bases: the mean's numbers have a closed form given the scale's."""
+    at = np.arange(1, knots + 1)
+    x = np.linspace(0.0, 1.0, rows)
+    basis = np.cos(np.pi * x[:, None] * at) / at
+    net = bmc.BayesNet(plates={"row": rows, "knot": knots})
+    net.add("sd", bmc.HalfNormal(5.0))
+    for name in ("mean", "scale"):
+        net.add(f"{name}_z", bmc.Normal(0.0, 1.0), plates="knot")
+    net.add("mean", lambda mean_z: np.vecdot(basis, mean_z.array), plates="row")
+    net.add("scale", lambda scale_z, sd: np.exp(sd * np.vecdot(basis, scale_z.array)), plates="row")
+    net.add("y", lambda mean, scale: bmc.Normal(mean, scale), plates="row")
+    return net, {"y": np.sin(6 * x) + x * np.cos(40 * x)}
+
+
+def test_blocks_beside_what_they_hang_on() -> None:
+    """All numbers together cost what a block costs; a model that is one block is left to Gibbs."""
+    engine, why = chosen(*splines(40))
+    assert isinstance(engine, bmc.HamiltonianMonteCarlo)
+    assert why.startswith("41 of 81 numbers") and "hang together" in why
+    assert chosen(*splines(20)) is None
+
+
 def test_numpy_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (machine, compiled_density):
         monkeypatch.setattr(module, "is_available", lambda: False)
