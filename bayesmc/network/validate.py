@@ -138,7 +138,8 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
             return  # ranks mix draws, and what they make together need not be reachable
         raise BroadcastError(
             f"{_what(node)} does not broadcast parents of unlike batch shapes: {error}; use bmc.stack for "
-            "np.stack, and let every operation broadcast"
+            "np.stack, give the parts of np.concatenate one batch first (a + 0 * b[..., :1], b + 0 * "
+            "a[..., :1]), and let every operation broadcast"
         ) from error
     q, p = shape
     _compare_entries(node, mixed, shape, ranks, [(0, 0), (q - 1, 0), (q - 1, p - 1)], batch)
