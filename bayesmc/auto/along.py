@@ -10,7 +10,7 @@ engine's own: hardly slower there, and fewer trajectories diverge.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, Plan
@@ -29,8 +29,9 @@ from bayesmc.structure.free_density import UnconstrainedDensity
 #: share of all numbers that have no closed form, at least; numbers of which a density is made to ask, at most
 _MOST_OF = 0.5
 _LARGEST = 4096
-#: numbers up to which trajectories learn correlations, and need no block beside others
-_JOINT = 200
+#: numbers up to which trajectories learn correlations, and need no block beside others; share of them that
+#: are in blocks, or moved by slices, at least
+_JOINT, _LEAST_OF = 200, 0.2
 #: joint states of the labels of an element that are summed over, at most
 _STATES = 16
 _ACCEPTED = 0.9
@@ -65,7 +66,8 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
     few = 0 if labels else CROWD
     if not labels and not slices and slow == total:  # Gibbs moves all numbers so
         return None
-    if not blocks or total > _JOINT:  # a block costs about what all numbers together do
+    together = total <= _JOINT and slow >= _LEAST_OF * total and _hang(plan, blocks, sizes)
+    if not together:  # where a block hangs on others it costs about what all numbers together do
         if not few < slow or slow < _MOST_OF * total or total > _LARGEST:
             return None
     engine = HamiltonianMonteCarlo(target_accept=_ACCEPTED, marginalize=bool(labels))
@@ -83,7 +85,7 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
             f"{shown} {'is' if len(labels) == 1 else 'are'} summed out, element by element: drawn in turn, "
             f"labels and the {slow} numbers without a closed form would hold each other",
         )
-    how = "one by one" if slices else "apart from those with which they hang together"
+    how = "apart from those with which they hang together" if together else "one by one"
     return (
         engine,
         f"{slow} of {total} numbers have no closed form, and a sweep would move them {how}",
@@ -106,6 +108,16 @@ def _is_compiled(problem: Problem, density: UnconstrainedDensity, engine: ChainE
     lengths = engine.lengths(problem)
     made = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains)
     return "trajectories" in made.told
+
+
+def _hang(plan: Plan, blocks: Sequence[Kernel], names: Iterable[str]) -> bool:
+    """Whether blocks share terms with numbers that others move."""
+    inside = {n for kernel in blocks for n in kernel.names}
+    own, others = (
+        {id(t) for t in plan.target.terms_of(tuple(n for n in names if (n in inside) == is_in))}
+        for is_in in (True, False)
+    )
+    return not own.isdisjoint(others)
 
 
 def _are_apart(problem: Problem, numbers: tuple[str, ...], count: int) -> bool:

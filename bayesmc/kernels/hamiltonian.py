@@ -298,7 +298,7 @@ class Hamiltonian(Kernel):
         rng: np.random.Generator,
     ) -> Memory:
         """The memory after a sweep of the warmup: the step always, the metric within windows."""
-        sweep, pooled = memory["sweep"] + 1, memory["windows"] >= self.beginning
+        sweep, pooled = memory["sweep"] + 1, self._is_pooled(memory)
         memory = {**memory, "sweep": sweep}
         memory["step"] = self.step_size.learnt(memory["step"], acceptance, pooled)
         if memory["windows"] == len(self.ends):
@@ -310,8 +310,11 @@ class Hamiltonian(Kernel):
             return memory
         memory["metric"] = self.metric.renewed(memory["metric"])
         memory["windows"] += 1
-        pooled = memory["windows"] >= self.beginning
-        return self._first_steps(gradient, place, memory, rng, pooled)
+        return self._first_steps(gradient, place, memory, rng, self._is_pooled(memory))
+
+    def _is_pooled(self, memory: Memory) -> bool:
+        """Whether all chains take the same step: after the beginning, which a short warmup is all of."""
+        return 0 < self.beginning <= memory["windows"]
 
     def _bent(self, memory: Memory) -> Memory:
         """The memory with divergences of this window counted, and at its end a target nearer to 1, once."""

@@ -33,20 +33,22 @@ _SHORT = (0.15, 0.10)
 _LEAST = 20
 #: the end of the beginning of a warmup of no known length, and how often it may double
 _OPEN, _DOUBLINGS = 20, 20
-#: the first window of the beginning, which double as well
+#: the first window of the beginning; the next are twice as long, if there is room
 _FIRST = 10
 #: constants of dual averaging: shrinkage towards ten times the first step, early steps, decay
 _GAMMA, _EARLY, _KAPPA, _AHEAD = 0.05, 10.0, 0.75, math.log(10.0)
 #: share of trajectories that diverges by chance, at most; by how much the target of acceptance comes nearer
 #: to 1 where more do
 _DIVERGED, _NEARER = 1e-3, 4.0
+#: trajectories among which a single one that diverges tells nothing
+_FEW_MADE = 500
 #: doublings (or halvings) in search of a first step
 _SEARCH = 60
 #: draws of all chains below which a metric stays as it is
 _FEW = 10
 #: share of the mean variance of whitened numbers that is added to theirs, and to that of gradients, so that
-#: directions that no draw tells of stay as they are; and the ratio of variances up to which a direction is
-#: left so, for it may be chance
+#: directions that no draw tells of have the scales of their numbers; and the ratio of variances up to which a
+#: direction is left so, for it may be chance
 _ADDED, _CHANCE = 1e-5, 2.0
 #: ratio of scales of the first metric to their median, at most
 _RANGE = 1e6
@@ -197,7 +199,7 @@ class Bends:
     def target(self, memory: np.ndarray, target: float) -> float:
         """The acceptance that steps are learnt for after a window."""
         diverged, count = memory
-        if diverged <= _DIVERGED * count:
+        if diverged <= max(_DIVERGED * count, float(count < _FEW_MADE)):
             return target
         return 1.0 - (1.0 - target) / _NEARER
 
@@ -325,25 +327,26 @@ def _within(sums: dict[str, np.ndarray], count: int) -> np.ndarray:
     return sums["square"] / (len(sums["mean"]) * (count - 1))
 
 
-def _met(sums: dict[str, np.ndarray], count: int) -> np.ndarray:
-    """Which numbers have chains that have met, shape (size,).
+def _met(sums: dict[str, np.ndarray], count: int) -> bool:
+    """Whether chains have met, in all their numbers.
 
-    Chains that have not, as where they name components differently, say nothing of how far a step may go.
+    Chains that have not, as where they name components differently, say nothing of how far a step may go; and
+    gradients by numbers that have met tell of those that have not.
     """
     within = _within(sums, count)
     inside = within if within.ndim == 1 else np.diagonal(within)
     mean = sums["mean"]
     between = np.square(mean - mean.mean(axis=0)).sum(axis=0)
-    return np.asarray(between <= _APART * (len(mean) - 1) * inside)
+    return bool((between <= _APART * (len(mean) - 1) * inside).all())
 
 
-def _spread(sums: dict[str, np.ndarray], count: int, met: np.ndarray) -> np.ndarray:
-    """Variances or covariances of a window's draws, those between chains counted where these have met."""
+def _spread(sums: dict[str, np.ndarray], count: int, met: bool) -> np.ndarray:
+    """Variances or covariances of a window's draws, those between chains counted if these have met."""
     within, mean = _within(sums, count), sums["mean"]
     chains = len(mean)
-    if chains == 1:
+    if chains == 1 or not met:
         return np.asarray(within)
-    away = (mean - mean.mean(axis=0)) * met
+    away = mean - mean.mean(axis=0)
     between = np.square(away).sum(axis=0) if within.ndim == 1 else away.T @ away
     return np.asarray((1.0 - 1.0 / count) * within + between / (chains - 1))
 

@@ -134,7 +134,12 @@ def _of_elements(name: str, own: tuple[str, ...], event: Shape, plates: Iterable
     if event:
         index = ", ".join([*own, "k"])
         return f"{told} {name}.array[..., {zeros}, {index}] for component k of each row's element"
-    return f"{told} np.vecdot(X, {name}.array) for a sum over them with weights X (np.matvec adds an axis)"
+    picked = f"{told} {name}[{', '.join(own)}] for each row's element"
+    if len(own) > 1:
+        return picked
+    return (
+        f"{picked}, or np.vecdot(X, {name}.array) for a sum with weights X (np.matvec adds an axis)"
+    )
 
 
 def sizes_beyond(shape: Shape, target: Shape) -> set[int]:

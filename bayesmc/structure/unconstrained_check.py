@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from itertools import chain
+from itertools import islice
 
 import numpy as np
 import scipy
@@ -37,6 +37,8 @@ _RTOL = 1e-9
 #: how much lower the log density may be than where all agree, for something that differs to count: far out a
 #: solver of differential equations makes much of rounding, and nobody ever gets there
 _NOWHERE_NEAR = 1000.0
+#: points at the end of a climb, and beside it, that are compared before that
+_AT_HEIGHT = 4
 #: how far those may be that are written for free numbers far out: where probabilities are near 0 or 1 the
 #: model's own lose digits
 _WRITTEN = 1e-7
@@ -106,8 +108,15 @@ def hold_against_model(
         return True
 
     highest, doubts = -np.inf, list[tuple[float, UnsupportedError]]()
-    points = chain(_points(density), _positive(density, is_enough), _uphill(density, is_enough))
-    for u, values in points:
+
+    def points() -> Iterator[tuple[np.ndarray, Values]]:
+        yield from _points(density)
+        yield from _positive(density, is_enough)
+        yield from _uphill(density, is_enough)
+        if doubts:  # they are only let pass where the density agrees at its height
+            yield from islice(_uphill(density, lambda: False), _AT_HEIGHT)
+
+    for u, values in points():
         log = float(density.value(u, values))
         try:
             if not hold(u, values):

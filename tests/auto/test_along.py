@@ -82,6 +82,14 @@ def test_blocks_beside_what_they_hang_on() -> None:
     assert chosen(*splines(20)) is None
 
 
+def test_blocks_beside_what_has_nothing_to_do_with_them() -> None:
+    net, evidence = litters(rows=80, closed=True)
+    net.add("a", bmc.LogNormal(0.0, 1.0))
+    net.add("b", bmc.LogNormal(0.0, 1.0))
+    net.add("y", lambda a, b: bmc.Normal(a * b, 1.0))
+    assert chosen(net, {**evidence, "y": 2.0}) is None
+
+
 def test_numpy_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in (machine, compiled_density):
         monkeypatch.setattr(module, "is_available", lambda: False)

@@ -145,6 +145,38 @@ def test_a_metric_needs_few_draws_and_no_exploring(seen: float) -> None:
     assert _worst_ratio(own, root)[0] < 0.1
 
 
+@pytest.mark.parametrize("whole", [True, False])
+def test_chains_that_have_met_in_some_numbers(whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gradients by numbers that have met tell of those that have not: one verdict for all of them."""
+    rng = np.random.default_rng(SHIFT)
+    cov = equicorrelated(8, 0.95, np.ones(8))
+    root, apart = np.linalg.cholesky(cov), 40.0 * (np.arange(8) < 4)
+    centre = np.array([[-1.5], [-0.5], [0.5], [1.5]]) * apart
+    learning = MetricLearning("dense")
+    memory = learning.start(rng.standard_normal((4, 8)))
+    for _ in range(60):
+        u = centre + rng.standard_normal((4, 8)) @ root.T
+        memory = learning.learnt(memory, u, -u @ np.linalg.inv(cov))
+    if not whole:  # the negative control: what lies between chains is counted all the same
+        monkeypatch.setattr(hamiltonian_warmup, "_met", lambda sums, count: np.arange(8) >= 4)
+        plain = hamiltonian_warmup._spread
+
+        def masked(sums: Any, count: int, met: Any) -> np.ndarray:
+            mean = sums["mean"].mean(axis=0) + (sums["mean"] - sums["mean"].mean(axis=0)) * met
+            return plain({**sums, "mean": mean}, count, True)
+
+        monkeypatch.setattr(hamiltonian_warmup, "_spread", masked)
+    found = learning.renewed(memory)["root"]
+    least, largest = _worst_ratio(found @ found.T, root)
+    assert bool(0.3 < least and largest < 3.0) == whole
+
+
+def test_short_warmups_keep_steps_of_their_own() -> None:
+    kernel = Hamiltonian(OfNumbers(normal(np.eye(2)), 2), warmup=15)
+    values, memory = kernel.density, kernel.start({"x": np.zeros((3, 2))}, 3)
+    assert not kernel._is_pooled(memory) and values.size == 2
+
+
 def _worst_ratio(cov: np.ndarray, root: np.ndarray) -> np.ndarray:
     """The least and the largest ratio of variances in any direction."""
     back = np.linalg.inv(root)

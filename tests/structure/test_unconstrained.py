@@ -461,6 +461,24 @@ def test_values_outside_their_support_are_refused(outside: Any) -> None:
         bmc.log_density(net, {"y": 1.0}).unconstrain({"x": outside})
 
 
+@pytest.mark.parametrize("seen", [-10.0, 10.0])
+def test_a_fault_at_the_height_of_a_narrow_density_counts(seen: float) -> None:
+    """Points that agree may all lie far from the mode: a climb ends there."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda a: bmc.Normal(50.0 * a, 0.01))
+    plain = unconstrained_check._check_sum
+
+    def doubted(density: UnconstrainedDensity, parts: Any, u: np.ndarray, values: Values) -> None:
+        plain(density, parts, u, values)
+        if u[0] * seen > 0.5:
+            raise UnsupportedError("the log density is off")
+
+    with mock.patch.object(unconstrained_check, "_check_sum", doubted):
+        with pytest.raises(UnsupportedError, match="the log density is off"):
+            unconstrained_density(target_of(pose(net, {"y": seen})))
+
+
 @pytest.mark.parametrize("everywhere", [False, True])
 def test_what_differs_where_nobody_gets_counts_for_nothing(everywhere: bool) -> None:
     """Rounding that a coarse solver blows up far out; a fault shows where the density is high, too."""

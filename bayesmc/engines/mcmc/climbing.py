@@ -93,10 +93,17 @@ def row_logs(term: Term, values: Values, rows: int) -> np.ndarray:
 
 
 def data_logs(target: Target, values: Values, rows: int) -> np.ndarray:
-    """Log densities of what no chain moves, shape ``(rows,)``: of the data, and of potentials."""
-    found = np.zeros(rows)
+    """Log densities of the data, shape ``(rows,)``: of what is seen, if only in part, and of potentials.
+
+    Potentials of finite nodes alone are like a prior of these, and left out.
+    """
+    found, model = np.zeros(rows), target.model
     for term in target.terms.values():
-        if term.name not in target.chain:
+        if term.is_potential:
+            is_told = any(model[n].domain is None for n in target.hidden_above(term))
+        else:
+            is_told = term.name not in target.chain or target.seen(term.name) is not None
+        if is_told:
             found += row_logs(term, values, rows).reshape(rows, -1).sum(axis=1)
     return found
 

@@ -88,7 +88,7 @@ def trajectories_of(
 ) -> list[Hamiltonian]:
     """Kernels of nodes without a closed form that move better together than one at a time.
 
-    That is so up to so many numbers that their covariance is learnt. Of more that share terms, the larger
+    That is so up to `DENSE` numbers. Of more that share terms, the larger
     nodes are left to slices, which move all elements of a plate at once; vectors, which slices move number
     by number, are not. Many like nodes (slices of a template) count as one plate, and keep what shares terms
     with them. A node whose own density is another for each state of a hidden finite one is left out: no one

@@ -22,12 +22,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from bayesmc.engines.mcmc.climbing import data_logs
-from bayesmc.errors import BayesmcError
 from bayesmc.kernels.base import Kernel
 from bayesmc.structure.target import Target, Values
 
-#: starts for each chain, and rows of all of them, at most; sweeps of a run, and those before labels move
-_TRIED, _ROWS = 4, 64
+#: starts for each chain, rows of all of them, and numbers of all rows, at most
+_TRIED, _ROWS, _NUMBERS = 4, 64, 1_000_000
+#: sweeps of a run, and those before labels move
 _SWEEPS, _BEFORE = 30, 5
 #: labels from which on numbers are held by them
 _LABELS = 20
@@ -65,7 +65,8 @@ def by_short_runs(
     dict
         As ``draw(starts)``, which it is where there is no room for more, or where runs fail.
     """
-    tried = min(_TRIED, _ROWS // starts) // 2
+    numbers_of = sum(math.prod(target.model[n].value_shape) for n in target.chain)
+    tried = min(_TRIED, _ROWS // starts, _NUMBERS // (starts * numbers_of)) // 2
     if not tried or not kernels:
         return draw(starts)
     moving = (*target.chain, *target.links)
@@ -79,11 +80,14 @@ def by_short_runs(
             _run(target, numbers, values, before, rng)
             _run(target, kernels, values, _SWEEPS - before, rng)
             log = data_logs(target, values, starts * tried)
-        except BayesmcError:  # the run itself will say what is wrong
+        except Exception:  # also of somebody's own kernel: the run itself will say what is wrong
             return {**first, **{n: first[n][:starts] for n in moving}}
         found.append({n: values[n].reshape(tried, starts, *values[n].shape[1:]) for n in moving})
         logs.append(np.where(np.isnan(log), -np.inf, log).reshape(tried, starts))
-    best = np.concatenate(logs).argmax(axis=0), np.arange(starts)
+    together = np.concatenate(logs)
+    if not (together > -np.inf).any(axis=0).all():
+        return draw(starts)
+    best = together.argmax(axis=0), np.arange(starts)
     return {**values, **{n: np.concatenate([f[n] for f in found])[best] for n in moving}}
 
 

@@ -114,8 +114,9 @@ def of_states(found: FilteredParticles, slices: Slices) -> dict[str, float]:
             spread = np.full(1, 0.5)
         with np.errstate(divide="ignore", invalid="ignore"):
             off = np.where(errors > 0, errors / spread, 0.0)
-        each = off.reshape(-1, math.prod(node.event_shape)) if node.domain is None else off
-        ranked = np.sort(each.reshape(-1, each.shape[-1]), axis=0)
+        labelled = node.domain is not None and node.domain.labels is not None
+        numbers = off.shape[-1] if labelled else math.prod(node.event_shape)
+        ranked = np.sort(off.reshape(-1, numbers), axis=0)
         by_name[name] = float(ranked[math.ceil(SLICES * len(ranked)) - 1].max())
     return by_name
 
