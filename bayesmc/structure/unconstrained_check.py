@@ -70,44 +70,12 @@ def hold_against_model(
     UnsupportedError
         Says which term differs, or is zero at all points.
     """
-    program = Program([*plain, *used])
-    totals = Program([table.total for table in tables])
-    inside = {t.name for table in tables for t in table.terms}
-    names = [t.name for t in terms]
-    seen, agreed = [False] * len(terms), [False] * len(plain)
+    compared = _Compared(density, terms, plain, used, tables)
     told, is_positive = np.zeros(density.size, dtype=bool), False
+    highest, doubts = -np.inf, list[tuple[float, UnsupportedError]]()
 
     def is_enough() -> bool:
-        return all(seen) and all(agreed) and bool(told.all())
-
-    def hold(u: np.ndarray, values: Values) -> bool:
-        """Compare all at one point; whether there is anything to compare."""
-        found = [np.asarray(v) for v in program({**values, FREE: u})]
-        given, written = found[: len(plain)], found[len(plain) :]
-        wanted = [_counted(term, values) for term in terms]
-        # parameters out of range: where its own density is zero, a node's value may be anything
-        nowhere = [
-            w is not None and t.name in density.names and not np.isfinite(w).all()
-            for t, w in zip(terms, wanted, strict=True)
-        ]
-        for k, own in enumerate(wanted):
-            if own is not None and nowhere[k] >= any(nowhere):
-                seen[k] |= _compare(terms[k], given[k], own)
-        if any(nowhere):
-            return False
-        sums = {t.name: float(log.sum()) for t, log in zip(terms, given, strict=False)}
-        _check_tables(tables, sums, u, values)
-        volume = sum(float(v) for v in given[len(terms) :])
-        if not np.isclose(volume, density.log_volume(u, values), rtol=1e-8, atol=1e-8):
-            raise UnsupportedError("the change of volume differs from that of the maps")
-        outside = [float(w.sum()) for w, n in zip(written, names, strict=False) if n not in inside]
-        outside += [float(w) for w in (*written[len(terms) :], *totals({**values, FREE: u}))]
-        _check_sum(density, outside, u, values)
-        for k, (a, b) in enumerate(zip(given, written, strict=True)):
-            agreed[k] |= _is_written(a, b)
-        return True
-
-    highest, doubts = -np.inf, list[tuple[float, UnsupportedError]]()
+        return compared.is_complete and bool(told.all())
 
     def points() -> Iterator[tuple[np.ndarray, Values]]:
         yield from _points(density)
@@ -119,7 +87,7 @@ def hold_against_model(
     for u, values in points():
         log = float(density.value(u, values))
         try:
-            if not hold(u, values):
+            if not compared.hold(u, values):
                 continue
         except UnsupportedError as error:
             doubts.append((max(log, _own_log(density, values)), error))
@@ -131,15 +99,7 @@ def hold_against_model(
     for log, doubt in doubts:
         if not log < highest - _NOWHERE_NEAR:
             raise doubt
-    for name, is_seen in zip(names, seen, strict=True):
-        if not is_seen:
-            raise UnsupportedError(
-                f"the density of {name!r} is zero, or no number, at all points where it was tried (is the "
-                "evidence possible?), so that its expression cannot be held against its function"
-            )
-    if not all(agreed):
-        name = [*names, *density.names][agreed.index(False)]
-        raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
+    compared.refuse()
     if is_positive and not told.all():
         label = density.labels[int(np.argmin(told))]
         raise UnsupportedError(
@@ -160,6 +120,79 @@ def other_values(density: UnconstrainedDensity, k: int) -> Values:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+class _Compared:
+    """All parts of a log density beside the model's, point by point; see ``hold_against_model``."""
+
+    def __init__(
+        self,
+        density: UnconstrainedDensity,
+        terms: Sequence[Term],
+        plain: Sequence[Expression],
+        used: Sequence[Expression],
+        tables: Sequence[Summed],
+    ) -> None:
+        self._density, self._terms, self._tables = density, terms, tables
+        self._program, self._plain = Program([*plain, *used]), len(plain)
+        self._totals = Program([table.total for table in tables])
+        self._inside = {t.name for table in tables for t in table.terms}
+        self._names = [t.name for t in terms]
+        self._seen, self._agreed = [False] * len(terms), [False] * len(plain)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether each part was a number somewhere, and was compared there."""
+        return all(self._seen) and all(self._agreed)
+
+    def hold(self, u: np.ndarray, values: Values) -> bool:
+        """Compare all at one point; whether there is anything to compare.
+
+        Raises
+        ------
+        UnsupportedError
+        """
+        density, terms, names = self._density, self._terms, self._names
+        found = [np.asarray(v) for v in self._program({**values, FREE: u})]
+        given, written = found[: self._plain], found[self._plain :]
+        wanted = [_counted(term, values) for term in terms]
+        # parameters out of range: where its own density is zero, a node's value may be anything
+        nowhere = [
+            w is not None and t.name in density.names and not np.isfinite(w).all()
+            for t, w in zip(terms, wanted, strict=True)
+        ]
+        for k, own in enumerate(wanted):
+            if own is not None and nowhere[k] >= any(nowhere):
+                self._seen[k] |= _compare(terms[k], given[k], own)
+        if any(nowhere):
+            return False
+        sums = {t.name: float(log.sum()) for t, log in zip(terms, given, strict=False)}
+        _check_tables(self._tables, sums, u, values)
+        volume = sum(float(v) for v in given[len(terms) :])
+        if not np.isclose(volume, density.log_volume(u, values), rtol=1e-8, atol=1e-8):
+            raise UnsupportedError("the change of volume differs from that of the maps")
+        outside = [
+            float(w.sum()) for w, n in zip(written, names, strict=False) if n not in self._inside
+        ]
+        outside += [float(w) for w in (*written[len(terms) :], *self._totals({**values, FREE: u}))]
+        _check_sum(density, outside, u, values)
+        for k, (a, b) in enumerate(zip(given, written, strict=True)):
+            self._agreed[k] |= _is_written(a, b)
+        return True
+
+    def refuse(self) -> None:
+        """Raise for what was no number at all points, or differs as it is written for free numbers."""
+        for name, is_seen in zip(self._names, self._seen, strict=True):
+            if not is_seen:
+                raise UnsupportedError(
+                    f"the density of {name!r} is zero, or no number, at all points where it was tried "
+                    "(is the evidence possible?), so that its expression cannot be held against its function"
+                )
+        if not all(self._agreed):
+            name = [*self._names, *self._density.names][self._agreed.index(False)]
+            raise UnsupportedError(
+                f"the term of {name!r}, written for free numbers, differs from it"
+            )
 
 
 def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]]:
