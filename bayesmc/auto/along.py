@@ -20,6 +20,7 @@ from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
+from bayesmc.kernels.hamiltonian_warmup import fitting
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.network import Problem
@@ -29,9 +30,8 @@ from bayesmc.structure.free_density import UnconstrainedDensity
 #: share of all numbers that have no closed form, at least; numbers of which a density is made to ask, at most
 _MOST_OF = 0.5
 _LARGEST = 4096
-#: numbers up to which trajectories learn correlations, and need no block beside others; share of them that
-#: are in blocks, or moved by slices, at least
-_JOINT, _LEAST_OF = 200, 0.2
+#: share of numbers whose correlations trajectories learn that are in blocks, or moved by slices, at least
+_LEAST_OF = 0.2
 #: joint states of the labels of an element that are summed over, at most
 _STATES = 16
 _ACCEPTED = 0.9
@@ -66,8 +66,10 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
     few = 0 if labels else CROWD
     if not labels and not slices and slow == total:  # Gibbs moves all numbers so
         return None
-    together = total <= _JOINT and slow >= _LEAST_OF * total and _hang(plan, blocks, sizes)
-    if not together:  # where a block hangs on others it costs about what all numbers together do
+    # where correlations are learnt, a block that hangs on others costs about what all numbers together do
+    learnt = fitting("auto", total) == "dense"
+    together = learnt and slow >= _LEAST_OF * total and _hang(plan, blocks, sizes)
+    if not together:
         if not few < slow or slow < _MOST_OF * total or total > _LARGEST:
             return None
     engine = HamiltonianMonteCarlo(target_accept=_ACCEPTED, marginalize=bool(labels))
