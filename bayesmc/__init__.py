@@ -8,18 +8,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import (
-    Explanation,
-    explain,
-    filter,
-    forecast,
-    infer,
-    infer_many,
-    load,
-    most_likely,
-    prior_predict,
-    smooth,
-)
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
@@ -58,40 +46,53 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
-from bayesmc.engines.approximate.laplace import LaplaceApproximation
-from bayesmc.engines.approximate.posterior_mode import PosteriorMode, map
-from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.exact.exact import Exact
-from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
-from bayesmc.engines.grid.filter import GridFilter
-from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
-from bayesmc.engines.mcmc.gibbs import Gibbs
-from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
-from bayesmc.engines.mcmc.metropolis import MetropolisHastings
-from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
-from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.filter import ParticleFilter
-from bayesmc.engines.particles.islands import IslandFilter
-from bayesmc.engines.particles.kld import KLD
-from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
-from bayesmc.engines.switching.filter import SwitchingKalmanFilter
-from bayesmc.engines.variational.mean_field import MeanField
-from bayesmc.engines.weighted.importance import Importance
-from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
-from bayesmc.engines.weighted.rejection import Rejection
-from bayesmc.learning import Fit, fit
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.objects import FrozenObject
 from bayesmc.plates import PlateArray, stack
-from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Elpd, Marginal, Pictures, Posterior, SeriesPosterior, Summary, compare
 from bayesmc.storage import CheckpointFile
 from bayesmc.structure.log_density import log_density
 
 if TYPE_CHECKING:
     from bayesmc import io, markov, montecarlo
+    from bayesmc.auto import (
+        Explanation,
+        explain,
+        filter,
+        forecast,
+        infer,
+        infer_many,
+        load,
+        most_likely,
+        prior_predict,
+        smooth,
+    )
+    from bayesmc.engines.approximate.laplace import LaplaceApproximation
+    from bayesmc.engines.approximate.posterior_mode import PosteriorMode, map
+    from bayesmc.engines.discrete.filter import DiscreteFilter
+    from bayesmc.engines.exact.exact import Exact
+    from bayesmc.engines.factored.filter import BoyenKoller, FactoredFrontier
+    from bayesmc.engines.grid.filter import GridFilter
+    from bayesmc.engines.kalman.filter import KalmanFilter
+    from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
+    from bayesmc.engines.mcmc.gibbs import Gibbs
+    from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
+    from bayesmc.engines.mcmc.metropolis import MetropolisHastings
+    from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
+    from bayesmc.engines.particles.belief import ParticleBelief
+    from bayesmc.engines.particles.filter import ParticleFilter
+    from bayesmc.engines.particles.islands import IslandFilter
+    from bayesmc.engines.particles.kld import KLD
+    from bayesmc.engines.particles.recovery import Recovery
+    from bayesmc.engines.propagation.engine import AssumedDensity, ExpectationPropagation
+    from bayesmc.engines.switching.filter import SwitchingKalmanFilter
+    from bayesmc.engines.variational.mean_field import MeanField
+    from bayesmc.engines.weighted.importance import Importance
+    from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
+    from bayesmc.engines.weighted.rejection import Rejection
+    from bayesmc.learning.fit import fit
+    from bayesmc.learning.fitted import Fit
+    from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 
 __version__ = "0.2.0"
 
@@ -194,14 +195,67 @@ __all__ = [
 ]
 
 
-_LATER = ("io", "markov", "montecarlo", "plotting", "robotics", "sklearn", "testing", "vision")
+#: rooms that load when first asked for, as not every program needs them
+_ROOMS = ("io", "markov", "montecarlo", "plotting", "robotics", "sklearn", "testing", "vision")
+#: module -> its names that load it when first asked for, so that an import alone is quick: what asks and
+#: answers is two thirds of the package. Type checkers read the same names above.
+_WHERE = {
+    "auto": (
+        "Explanation",
+        "explain",
+        "filter",
+        "forecast",
+        "infer",
+        "infer_many",
+        "load",
+        "most_likely",
+        "prior_predict",
+        "smooth",
+    ),
+    "engines.approximate.laplace": ("LaplaceApproximation",),
+    "engines.approximate.posterior_mode": ("PosteriorMode", "map"),
+    "engines.discrete.filter": ("DiscreteFilter",),
+    "engines.exact.exact": ("Exact",),
+    "engines.factored.filter": ("BoyenKoller", "FactoredFrontier"),
+    "engines.grid.filter": ("GridFilter",),
+    "engines.kalman.filter": ("KalmanFilter",),
+    "engines.kalman.nonlinear": ("ExtendedKalmanFilter", "UnscentedKalmanFilter"),
+    "engines.mcmc.gibbs": ("Gibbs",),
+    "engines.mcmc.hamiltonian": ("HamiltonianMonteCarlo",),
+    "engines.mcmc.metropolis": ("MetropolisHastings",),
+    "engines.mcmc.proposals": ("Independence", "RandomWalk"),
+    "engines.particles.belief": ("ParticleBelief",),
+    "engines.particles.filter": ("ParticleFilter",),
+    "engines.particles.islands": ("IslandFilter",),
+    "engines.particles.kld": ("KLD",),
+    "engines.particles.recovery": ("Recovery",),
+    "engines.propagation.engine": ("AssumedDensity", "ExpectationPropagation"),
+    "engines.switching.filter": ("SwitchingKalmanFilter",),
+    "engines.variational.mean_field": ("MeanField",),
+    "engines.weighted.importance": ("Importance",),
+    "engines.weighted.likelihood_weighting": ("LikelihoodWeighting",),
+    "engines.weighted.rejection": ("Rejection",),
+    "learning.fit": ("fit",),
+    "learning.fitted": ("Fit",),
+    "pmcmc": ("ParticleGibbs", "ParticleMetropolis"),
+}
+_MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:
-    """What not every program needs loads when first asked for."""
-    if name in _LATER:
+    """Loads the module behind a name that is asked for the first time (PEP 562)."""
+    if name in _ROOMS:
         return importlib.import_module(f"bayesmc.{name}")
-    raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")
+    if name not in _MODULES:
+        raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")
+    found = getattr(importlib.import_module(f"bayesmc.{_MODULES[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    """All names, those not loaded yet included."""
+    return sorted({*globals(), *__all__, *_ROOMS})
 
 
 # answers stand below what draws them

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.fft
 import scipy.special
 
 #: below this effective size a weighted answer has no reliable error bar either
@@ -385,6 +384,8 @@ def _ensemble_ess(values: np.ndarray, block: int) -> np.ndarray:
 
 def _ess_of_halves(split: np.ndarray) -> np.ndarray:
     """Effective sizes for means of half-chains, by Geyer's initial monotone sequence."""
+    import scipy.fft  # a tenth of the time that importing the package takes
+
     _, chains, draws = split.shape
     size = chains * draws
     length = scipy.fft.next_fast_len(2 * draws, real=True)

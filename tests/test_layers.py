@@ -18,6 +18,7 @@ from pathlib import Path
 
 import pytest
 
+import bayesmc
 from tests.counts.lines import long_functions, long_modules, parsed, sources
 
 PACKAGE = Path(__file__).resolve().parents[1] / "bayesmc"
@@ -294,10 +295,41 @@ def test_modules_and_functions_get_shorter() -> None:
     assert {length.what for length in long_functions(texts)} <= LONG_FUNCTIONS
 
 
-def test_import_loads_nothing_heavy() -> None:
-    code = "import json, sys, bayesmc; print(json.dumps(sorted(sys.modules)))"
-    loaded = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, text=True,
-                            capture_output=True, check=True)  # fmt: skip
-    modules = json.loads(loaded.stdout)
+@pytest.mark.parametrize("statement", ["import bayesmc", "from bayesmc import *"])
+def test_import_loads_nothing_heavy(statement: str) -> None:
+    modules = _loaded_by(statement)
     assert "bayesmc" in modules
     assert [name for name in modules if _is_heavy(name)] == []
+
+
+def test_engines_load_when_first_named() -> None:
+    rooms = {".".join(m.split(".")[:2]) for m in _loaded_by("import bayesmc")}
+    assert rooms.isdisjoint(
+        {"bayesmc.engines", "bayesmc.auto", "bayesmc.learning", "bayesmc.pmcmc"}
+    )
+    assert "bayesmc.engines.mcmc.gibbs" in _loaded_by("import bayesmc; bayesmc.Gibbs")
+    assert "bayesmc.auto" in _loaded_by("import bayesmc; bayesmc.infer")
+
+
+def test_names_that_load_later_are_those_of_type_checkers() -> None:
+    tree = parsed((PACKAGE / "__init__.py").read_text())
+    [checked] = [node for node in tree.body if isinstance(node, ast.If)]
+    told = {
+        alias.name: node.module
+        for node in checked.body
+        if isinstance(node, ast.ImportFrom) and node.module not in (None, "bayesmc")
+        for alias in node.names
+    }
+    assert told == {name: f"bayesmc.{module}" for name, module in bayesmc._MODULES.items()}
+    assert set(told) <= set(bayesmc.__all__) <= set(dir(bayesmc))
+    assert all(getattr(bayesmc, name) is not None for name in bayesmc.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'KalmanFiler'"):
+        bayesmc.KalmanFiler  # noqa: B018
+
+
+def _loaded_by(statement: str) -> set[str]:
+    """Modules that a fresh interpreter has after a statement."""
+    code = f"import json, sys\n{statement}\nprint(json.dumps(sorted(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, text=True,
+                            capture_output=True, check=True)  # fmt: skip
+    return set(json.loads(loaded.stdout))
