@@ -23,7 +23,8 @@ def read_data(path: str | PathLike[str]) -> dict[str, np.ndarray]:
     whole numbers are integers. Arrays come as the program meant them: ``structure(c(...), .Dim=)`` by
     columns, ``list(y = structure(.Data=c(...), .Dim=))`` of WinBUGS by rows. Indices count from 1 in these
     programs and from 0 here: labels such as ``group``, and the codes of R's factors, are handed over as they
-    are (``group - 1`` is the position here). Lists within the data, and data frames, are refused.
+    are (``group - 1`` is the position here). Lists within the data, and data frames, are refused. Of what
+    people write by hand ``rep``, ``seq``, ``matrix``, ``array`` and names given before are read.
 
     Parameters
     ----------

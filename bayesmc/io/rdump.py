@@ -6,17 +6,21 @@ last index does (OpenBUGS user manual, "Model Specification: Formatting of Data"
 
 Of what ``structure`` sets only the dimensions are numbers; names, levels and classes are passed over, so that
 a factor is its codes, which R counts from 1. Lists within, and data frames, are no arrays and refused.
+
+People write what no dump does, and some of it is read: names given before, and the calls of ``rcalls``.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from os import PathLike
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.errors import FileFormatError
+from bayesmc.io.rcalls import CALLS, made
 
 _TOKEN = re.compile(
     r"""(?P<space>[\s;]+|\#[^\n]*)
@@ -32,7 +36,7 @@ _CONSTANTS = {"NA": np.nan, "NaN": np.nan, "Inf": np.inf, "TRUE": True, "FALSE":
 _EMPTY = {"integer": np.int64, "numeric": np.float64, "double": np.float64, "logical": np.bool_}
 #: conversions that older versions of R write around values, and ``as.vector``, which drops dimensions
 _AS = ("as.integer", "as.numeric", "as.double", "as.logical", "as.vector")
-_CALLS = ("c", "structure", *_EMPTY, *_AS)
+_CALLS = ("c", "structure", *CALLS, *_EMPTY, *_AS)
 #: arguments of ``structure`` that are numbers; others are texts or lists, and no part of an array
 _NUMBERS = ("data", "dim")
 
@@ -73,9 +77,10 @@ class _Reader:
         self.tokens = self._split(text)
         self.at = 0
         self.is_list = False
+        self.found: dict[str, np.ndarray] = {}
 
     def everything(self) -> dict[str, np.ndarray]:
-        found: dict[str, np.ndarray] = {}
+        found = self.found
         while self.now.kind != "end":
             if self.now.text == "list" and self.tokens[self.at + 1].text == "(":
                 self._next()
@@ -145,8 +150,10 @@ class _Reader:
             self._fail(f"{name!r} is given twice")
         found[name] = np.asarray(value)
 
-    def _arguments(self, skips: bool = False) -> list[tuple[str | None, Any]]:
-        """What stands in brackets: values, some with names; attributes of an array are passed over."""
+    def _arguments(
+        self, kept: Callable[[str], bool] = lambda name: True
+    ) -> list[tuple[str | None, Any]]:
+        """What stands in brackets: values, some with names; what is not kept by its name is passed over."""
         found: list[tuple[str | None, Any]] = []
         self._take("(")
         while self.now.text != ")":
@@ -154,7 +161,7 @@ class _Reader:
             name = self._named() if named else None
             if named:
                 self._next()
-            if skips and name is not None and _bare(name) not in _NUMBERS:
+            if name is not None and not kept(name):
                 self._skip()
             else:
                 found.append((name, self._value()))
@@ -195,9 +202,13 @@ class _Reader:
             return _whole(np.asarray(float(token.text.removesuffix("L"))))[()]
         if token.kind == "name" and self.now.text == "(":
             return self._call(token)
+        if token.kind == "name" and token.text in self.found and not self.is_list:
+            return self.found[token.text]
         if token.kind == "name" and token.text in _CONSTANTS:
             return _CONSTANTS[token.text]
         self.at -= token.kind != "end"
+        if token.kind == "name":
+            return self._fail(f"{token.text!r} is no number, and nothing before gives it one")
         return self._fail(f"a number is wanted, and {self._shown()} is there")
 
     def _call(self, token: _Token) -> Any:
@@ -214,9 +225,11 @@ class _Reader:
                 self.path,
                 token.line,
             )
-        given = self._arguments(skips=token.text == "structure")
+        if token.text in CALLS:
+            return self._made(token)
         if token.text == "structure":
-            return self._array(given)
+            return self._array(self._arguments(lambda name: _bare(name) in _NUMBERS))
+        given = self._arguments()
         if token.text == "c":
             parts = [np.ravel(value, order="F") for _, value in given]
             return _whole(np.concatenate(parts)) if parts else np.zeros(0)
@@ -228,6 +241,13 @@ class _Reader:
         if len(given) > 1 or np.ndim(count) or not 0 <= count < np.inf:
             self._fail(f"{token.text}(n) takes one length")
         return np.zeros(int(count), _EMPTY[token.text])
+
+    def _made(self, token: _Token) -> np.ndarray:
+        given = self._arguments(lambda name: name != "dimnames")
+        try:
+            return _whole(made(token.text, given))
+        except ValueError as error:
+            raise FileFormatError(str(error), self.path, token.line) from None
 
     def _array(self, given: list[tuple[str | None, Any]]) -> np.ndarray:
         parts = {"" if name is None else _bare(name): value for name, value in given}

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -125,6 +125,8 @@ def _kernels(dist: d.KernelDensity) -> Family:
 
 def _log_density(family: Family, x: Any) -> Any:
     form = _FORMS.get(family.make)
+    if form is None and _is_joint(family.make):
+        return _joint(x, list(family.parameters.values()))
     if form is None and has_own_form(family):
         return _own_form(family, x)
     if form is None:
@@ -396,11 +398,9 @@ def _mixture(x: Any, weights: Any, components: Any) -> Any:
 
 
 def _joint(x: Any, parts: Any) -> Any:
-    if len(parts) == 1 and isinstance(parts[0], (list, tuple)):
-        parts = parts[0]
     total: Any = 0.0
     start = 0
-    for part in map(_part, parts):
+    for part in _side_by_side(parts):
         if part.make not in _VECTORS:
             total, start = total + _log_density(part, x[..., start]), start + 1
             continue
@@ -408,6 +408,21 @@ def _joint(x: Any, parts: Any) -> Any:
         stop = start + sized.shape[-1]
         total, start = total + _log_density(part, x[..., start:stop]), stop
     return total
+
+
+def _side_by_side(parts: Any) -> Iterator[Family]:
+    """Parts, those of parts that are joints themselves in their place."""
+    if len(parts) == 1 and isinstance(parts[0], (list, tuple)):
+        parts = parts[0]
+    for part in map(_part, parts):
+        if _is_joint(part.make):
+            yield from _side_by_side(part.parameters.get("parts", list(part.parameters.values())))
+        else:
+            yield part
+
+
+def _is_joint(make: Any) -> bool:
+    return isinstance(make, type) and issubclass(make, d.Joint)
 
 
 def _affine(x: Any, base: Any, loc: Any, scale: Any) -> Any:

@@ -49,6 +49,44 @@ def test_numbers_of_r(text: str, wanted: dict) -> None:
     assert all(a.dtype.kind in "ib" for n, a in found.items() if n in ("N", "none", "is"))
 
 
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        (
+            "rc <- c(2, 23)\ny <- matrix(rep(rc, each=2), nrow=2, ncol=2)",
+            {"rc": [2, 23], "y": [[2, 23], [2, 23]]},
+        ),
+        ("T <- 3\ny <- rep(0, T)\nz <- 1:T", {"T": 3, "y": [0, 0, 0], "z": [1, 2, 3]}),
+        (
+            "y <- rep(c(1, 2), times = c(2, 1))\nz <- rep(1:2, length.out = 3)",
+            {"y": [1, 1, 2], "z": [1, 2, 1]},
+        ),
+        (
+            "y <- seq(0, 1, by = 0.25)\nz <- seq(2, 8, length = 4)",
+            {"y": [0, 0.25, 0.5, 0.75, 1], "z": [2, 4, 6, 8]},
+        ),
+        (
+            "y <- seq(3)\nz <- seq(3, 1)\nw <- seq(5, by = 2, len = 3)",
+            {"y": [1, 2, 3], "z": [3, 2, 1], "w": [5, 7, 9]},
+        ),
+        (
+            "y <- matrix(1:6, 2)\nz <- matrix(1:4, ncol = 2, byrow = TRUE)",
+            {"y": [[1, 3, 5], [2, 4, 6]], "z": [[1, 2], [3, 4]]},
+        ),
+        (
+            "y <- matrix(NA, 1, 2)\nz <- array(1:4, dim = c(2, 1, 2))",
+            {"y": [[np.nan, np.nan]], "z": [[[1, 3]], [[2, 4]]]},
+        ),
+        ('y <- matrix(0, 1, 2, dimnames = list(NULL, c("a", "b")))', {"y": [[0, 0]]}),
+    ],
+)
+def test_what_people_write_by_hand(text: str, wanted: dict) -> None:
+    found = parse_rdump(text)
+    assert list(found) == list(wanted)
+    for name, value in wanted.items():
+        np.testing.assert_array_equal(found[name], value)
+
+
 def test_cubes_run_by_the_first_index_in_r_and_by_the_last_in_bugs() -> None:
     by_r = parse_rdump("y <- structure(1:24, .Dim = c(2, 3, 4))")["y"]
     by_bugs = parse_rdump("list(y = structure(.Data = c(1:24), .Dim = c(2, 3, 4)))")["y"]
@@ -63,6 +101,19 @@ def test_cubes_run_by_the_first_index_in_r_and_by_the_last_in_bugs() -> None:
         ("N 3", 1, "'<-' is wanted after 'N', and '3' is there"),
         ("y <- factor(c(1))", 1, "factor(...) is not known here"),
         ("\n\ny <- structure(c(1,2,3), .Dim = c(2,2))", 3, "takes 4 numbers, and 3 are given"),
+        ("y <- matrix(1:6, 4)", 1, "matrix(...) has 8 places, and 6 values do not fill them"),
+        ("y <- matrix(1:4, foo = 2)", 1, "no argument 'foo' here (it has data, nrow, ncol, byrow)"),
+        ("y <- matrix(1:4, n = 2)", 1, "no argument 'n' here"),
+        ("y <- array(1, 2, 3)", 1, "array(...) is given too much (it has data, dim)"),
+        ("\ny <- rep(1:3, times = c(1, 2))", 2, "rep(...) has 3 values, and times has 2"),
+        ("y <- rep()", 1, "nothing to repeat"),
+        ("y <- rep(1, -1)", 1, "times is one number, 0 or more"),
+        ("y <- rep(1, each = 2, each = 2)", 1, "is given 'each' twice"),
+        ("y <- seq(1, 5, by = -1)", 1, "does not get from 1 to 5 by -1"),
+        ("y <- seq(c(1, 2), 5)", 1, "seq(...) takes single numbers"),
+        ("y <- matrix(c(), 2, 2)", 1, "no values to fill 4 places with"),
+        ("y <- later\nlater <- 2", 1, "'later' is no number, and nothing before gives it one"),
+        ("list(N = 3, y = c(N))", 1, "'N' is no number"),
         ("y <- 'red'", 1, "a number is wanted, and \"'red'\" is there"),
         ("y <- 1\ny <- 2", 2, "'y' is given twice"),
         ("list(1, 2)", 1, "has no name"),

@@ -9,6 +9,7 @@ import bayesmc as bmc
 from bayesmc.expression import Family, Program, TracedArray, constant, leaf, reduction, trace
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.log_density import log_density
+from bayesmc.robotics import AndAngle
 
 A = np.array([0.7, 1.3, 2.1])
 P = np.array([0.2, 0.5, 0.9])
@@ -72,6 +73,16 @@ FAMILIES = {
     "MvNormal by scales": (
         lambda a, p: bmc.MvNormal(np.ones(2), scale_diag=bmc.stack([a, p])),
         [[0.0, 1.0], [2.0, 2.0], [-9.0, 1.0]],
+    ),
+    "Joint in a joint": (
+        lambda a, p: bmc.Joint(
+            [bmc.Joint([bmc.Normal(p, a), bmc.Gamma(a, p)]), bmc.Normal(a, 1.0)]
+        ),
+        [[0.1, 0.5, 1.0], [2.0, 3.0, -1.0], [-9.0, -1.0, 1.0]],
+    ),
+    "AndAngle": (
+        lambda a, p: AndAngle(bmc.Joint(bmc.Gamma(a, p), bmc.Normal(p, a)), bmc.VonMises(p, a)),
+        [[0.1, 0.5, 1.0], [2.0, 3.0, -1.0], [-9.0, -1.0, 1.0]],
     ),
     "Dirichlet": (lambda a, p: bmc.Dirichlet(bmc.stack([a, p, 2.0])), ROWS.tolist()),
     "Multinomial": (
