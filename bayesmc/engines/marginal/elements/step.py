@@ -33,6 +33,9 @@ from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.tables.step import Known
 from bayesmc.network import Observed
 
+#: standard deviations of a belief beyond which a pick has no share in a reading: less than exp(-98)
+_REACH = 14.0
+
 
 class ElementFilter:
     """The forward step of all elements of the particles of a template.
@@ -266,7 +269,9 @@ class ElementFilter:
                     return found
 
                 given = data.of(np.full(len(possible), r))
-                made = linearised(some, given, tangent, group.bent)
+                made = linearised(some, given, tangent, group.bent, _REACH)
+                if made.beyond is not None and _leaves_none(possible[~made.beyond], own):
+                    made = linearised(some, given, tangent, group.bent)
                 flat = joint.reshape(-1)
                 flat[possible] += made.log_predictive(some)
                 joint = flat.reshape(own.shape)
@@ -385,6 +390,14 @@ def gathered(pool: Pool, at: np.ndarray, particles: int) -> tuple[Belief, Any]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _leaves_none(near: np.ndarray, log_prior: np.ndarray) -> bool:
+    """Whether of some particle's possible picks, (particles, states), none is among some of all."""
+    left = np.zeros(log_prior.size, bool)
+    left[near] = True
+    reached = left.reshape(log_prior.shape).any(axis=1)
+    return bool((~reached & (log_prior > -np.inf).any(axis=1)).any())
 
 
 def looking_none(places: np.ndarray, chosen: np.ndarray, reading: int) -> np.ndarray:
