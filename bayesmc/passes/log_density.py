@@ -15,6 +15,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -125,8 +126,8 @@ def _kernels(dist: d.KernelDensity) -> Family:
 
 def _log_density(family: Family, x: Any) -> Any:
     form = _FORMS.get(family.make)
-    if form is None and _is_joint(family.make):
-        return _joint(x, list(family.parameters.values()))
+    if isinstance(family.make, type) and issubclass(family.make, d.Joint):
+        return _joint(x, family)
     if form is None and has_own_form(family):
         return _own_form(family, x)
     if form is None:
@@ -270,6 +271,10 @@ def _times(count: Any, log_p: Any) -> Any:
     return np.where(count == 0, 0.0, count * log_p)
 
 
+def _log_factorial(x: Any) -> Any:
+    return special.gammaln(x + 1.0)
+
+
 def _whole(x: Any) -> Any:
     return (x >= 0) & (x == np.floor(x))
 
@@ -277,10 +282,6 @@ def _whole(x: Any) -> Any:
 def _bernoulli(x: Any, probs: Any, logits: Any) -> Any:
     one, zero = _log_odds(probs, logits)
     return np.where(x == 1, one, np.where(x == 0, zero, -np.inf))
-
-
-def _log_factorial(x: Any) -> Any:
-    return special.gammaln(x + 1.0)
 
 
 def _binomial(x: Any, total_count: Any, probs: Any, logits: Any) -> Any:
@@ -306,8 +307,7 @@ def _negative_binomial(x: Any, total_count: Any, probs: Any, logits: Any) -> Any
 
 
 def _discrete_uniform(x: Any, low: Any, high: Any) -> Any:
-    inside = (x >= low) & (x <= high) & (x == np.floor(x))
-    return _inside(inside, -np.log(1.0 * high - low + 1.0))
+    return _inside((x >= low) & (x <= high) & (x == np.floor(x)), -np.log(1.0 * high - low + 1.0))
 
 
 def _log_probs(probs: Any, logits: Any) -> Any:
@@ -355,14 +355,6 @@ def _matrices(x: Any, df: Any, scale: Any, is_inverse: bool) -> Any:
     return logs - 0.5 * trace_of - norm + np.where(df > size - 1, 0.0, -np.inf)
 
 
-def _wishart(x: Any, df: Any, scale: Any) -> Any:
-    return _matrices(x, df, scale, False)
-
-
-def _inverse_wishart(x: Any, df: Any, scale: Any) -> Any:
-    return _matrices(x, df, scale, True)
-
-
 def _wrapped_normal(x: Any, loc: Any, scale: Any) -> Any:
     turn = 2 * math.pi
     off = x - loc
@@ -397,32 +389,24 @@ def _mixture(x: Any, weights: Any, components: Any) -> Any:
     return log_sum_exp(logs + parts, axis=-1)
 
 
-def _joint(x: Any, parts: Any) -> Any:
-    total: Any = 0.0
-    start = 0
-    for part in _side_by_side(parts):
-        if part.make not in _VECTORS:
-            total, start = total + _log_density(part, x[..., start]), start + 1
-            continue
-        sized = next(v for v in part.parameters.values() if isinstance(v, Expression) and v.shape)
-        stop = start + sized.shape[-1]
-        total, start = total + _log_density(part, x[..., start:stop]), stop
+def _joint(x: Any, family: Family) -> Any:
+    total, at = 0.0, 0
+    for part in _side_by_side(family):
+        known = (v for v in part.parameters.values() if isinstance(v, Expression) and v.shape)
+        size = next(known).shape[-1] if part.make in _VECTORS else 0
+        total = total + _log_density(part, x[..., at : at + size] if size else x[..., at])
+        at += max(size, 1)
     return total
 
 
-def _side_by_side(parts: Any) -> Iterator[Family]:
-    """Parts, those of parts that are joints themselves in their place."""
-    if len(parts) == 1 and isinstance(parts[0], (list, tuple)):
-        parts = parts[0]
-    for part in map(_part, parts):
-        if _is_joint(part.make):
-            yield from _side_by_side(part.parameters.get("parts", list(part.parameters.values())))
-        else:
-            yield part
-
-
-def _is_joint(make: Any) -> bool:
-    return isinstance(make, type) and issubclass(make, d.Joint)
+def _side_by_side(family: Family) -> Iterator[Family]:
+    """The parts of a joint, those of parts that are joints themselves in their place."""
+    if not (isinstance(family.make, type) and issubclass(family.make, d.Joint)):
+        yield family
+        return
+    parts = list(family.parameters.get("parts", family.parameters.values()))
+    for part in parts[0] if isinstance(parts[0], (list, tuple)) else parts:
+        yield from _side_by_side(_part(part))
 
 
 def _affine(x: Any, base: Any, loc: Any, scale: Any) -> Any:
@@ -459,6 +443,7 @@ _FORMS: Mapping[Any, Callable[..., Any]] = {
     d.Binomial: _binomial, d.Poisson: _poisson, d.Geometric: _geometric,
     d.NegativeBinomial: _negative_binomial, d.DiscreteUniform: _discrete_uniform,
     d.Categorical: _categorical, d.Multinomial: _multinomial, d.Mixture: _mixture,
-    d.Affine: _affine, d.Truncated: _truncated, d.Joint: _joint, d.Wishart: _wishart,
-    d.InverseWishart: _inverse_wishart, d.WrappedNormal: _wrapped_normal,
+    d.Affine: _affine, d.Truncated: _truncated, d.WrappedNormal: _wrapped_normal,
+    d.Wishart: partial(_matrices, is_inverse=False),
+    d.InverseWishart: partial(_matrices, is_inverse=True),
 }  # fmt: skip

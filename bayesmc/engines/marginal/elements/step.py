@@ -270,15 +270,14 @@ class ElementFilter:
 
                 given = data.of(np.full(len(possible), r))
                 made = linearised(some, given, tangent, group.bent, _REACH)
-                if made.beyond is not None and _leaves_none(possible[~made.beyond], own):
+                if _leaves_none(made.beyond, possible, own):
                     made = linearised(some, given, tangent, group.bent)
                 flat = joint.reshape(-1)
                 flat[possible] += made.log_predictive(some)
                 joint = flat.reshape(own.shape)
             level = log_sum_exp(joint, axis=1)
             np.add.at(log, (np.arange(n), self.group[at[:, 0]]), level)
-            chosen = _drawn(joint, rng)
-            picks[:, r] = chosen
+            picks[:, r] = chosen = _drawn(joint, rng)
             if made is not None:
                 flat = np.arange(n) * states + chosen
                 back = np.searchsorted(possible, flat)
@@ -392,10 +391,12 @@ def gathered(pool: Pool, at: np.ndarray, particles: int) -> tuple[Belief, Any]:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _leaves_none(near: np.ndarray, log_prior: np.ndarray) -> bool:
-    """Whether of some particle's possible picks, (particles, states), none is among some of all."""
+def _leaves_none(beyond: np.ndarray | None, possible: np.ndarray, log_prior: np.ndarray) -> bool:
+    """Whether all possible picks of some particle are beyond reach; priors are (particles, states)."""
+    if beyond is None:
+        return False
     left = np.zeros(log_prior.size, bool)
-    left[near] = True
+    left[possible[~beyond]] = True
     reached = left.reshape(log_prior.shape).any(axis=1)
     return bool((~reached & (log_prior > -np.inf).any(axis=1)).any())
 
