@@ -137,7 +137,7 @@ def slam(folder: Path) -> None:
     """Errors on the robots of an MRCLAM folder, and shares of readings assigned right."""
     from examples.slam_landmarks import figures, picks
 
-    for found in (figures(folder, particles=2000), picks(folder, particles=30)):
+    for found in (figures(folder), picks(folder)):
         for robot, own in found:
             print(robot, {k: round(v, 3) for k, v in own.items()}, flush=True)
 

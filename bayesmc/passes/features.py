@@ -50,6 +50,8 @@ from bayesmc.passes.reads import NOTHING, element_read, matrix_function, reads, 
 Feature = float | str
 LOG, LOG1M, CONSTANT = "log x", "log(1 - x)", 0.0
 Features = dict[Feature, Expression]
+#: powers beyond which nobody looks for a family: a polynomial is twice as long after each product
+_MOST = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +340,7 @@ def _square(found: Features) -> Features:
         for g, v in powers[k:]:
             term = elementwise(np.square, u) if f == g else multiply(2.0, multiply(u, v))
             squares[f + g] = add(squares.get(f + g, ZERO), term)  # type: ignore[operator]
-    return squares
+    return _few(squares)
 
 
 def _single(found: Features) -> Features:
@@ -353,6 +355,13 @@ def _product(first: Features, second: Features) -> Features:
         for g, v in second.items():
             both = f + g  # type: ignore[operator]
             found[both] = add(found.get(both, ZERO), multiply(u, v))
+    return _few(found)
+
+
+def _few(found: Features) -> Features:
+    """Powers, unless they are more than any family has: each step of a recursion doubles the degree."""
+    if len(found) > _MOST:
+        raise TraceError(f"more than {_MOST} powers of it are no features")
     return found
 
 

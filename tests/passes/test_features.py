@@ -122,3 +122,18 @@ def test_what_is_nested_without_end_is_refused():
     assert set(statistics(density(5), "x").coefficients) == {1.0, 2.0}
     with pytest.raises(TraceError, match="nested too deep"):
         statistics(density(400), "s")
+
+
+def test_a_recursion_of_products_is_no_polynomial_of_a_thousand_powers():
+    """Each step of a logistic map doubles the degree: what is followed has few powers, and the rest none."""
+
+    def mapped(x, steps):
+        for _ in range(steps):
+            x = 3.0 * x * (1 - x)
+        return x
+
+    few = trace(lambda x: mapped(x, 2), [TracedArray(leaf("x", ()))])
+    assert sorted(statistics(few, "x").coefficients) == [1.0, 2.0, 3.0, 4.0]
+    many = trace(lambda x: mapped(x, 60), [TracedArray(leaf("x", ()))])
+    with pytest.raises(TraceError, match="more than 16 powers"):
+        statistics(many, "x")
