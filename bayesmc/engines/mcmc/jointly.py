@@ -208,11 +208,10 @@ def _groups(target: Target, names: Sequence[str]) -> list[tuple[str, ...]]:
             if meets and _size(target, [*group, *merged]) <= DENSE:
                 merged = [*group, *merged]
                 groups.remove(group)
-        if len(merged) > 1 or not model[name].plates:
-            groups.append(merged)
-    return [
-        tuple(n for n in target.chain if n in group) for group in groups if _size(target, group) > 1
-    ]
+        groups.append(merged)
+    # the elements of one plate by themselves are moved at once by slices
+    several = [g for g in groups if len(g) > 1 or not model[g[0]].plates]
+    return [tuple(n for n in target.chain if n in g) for g in several if _size(target, g) > 1]
 
 
 def _joined(target: Target, group: tuple[str, ...], closed: Sequence[str]) -> tuple[str, ...]:
