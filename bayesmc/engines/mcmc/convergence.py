@@ -254,7 +254,8 @@ def _lasting(judged: _Judged) -> Iterator[str]:
         yield (
             "chains keep to where they are: the means of the first and the last third of each go together "
             f"for {worst!r} (correlation {judged.lasting[worst]:.2f} over chains): shares of modes are "
-            "those of the starts; use more warmup= and draws=, or another engine"
+            "those of the starts; begin near the mode that counts (start=), use more warmup= and draws=, or "
+            "another engine"
         )
 
 
