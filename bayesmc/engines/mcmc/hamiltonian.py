@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
@@ -29,7 +29,6 @@ from bayesmc.structure.target import target_of
 #: sweeps of which one moves scales with what they scale: a trajectory in machine code costs far less
 _RESCALED = 4
 _JUMPS = "the density jumps where it is compared, which no gradient sees"
-_METRICS = ("auto", "diagonal", "dense")
 
 
 @dataclass(frozen=True, repr=False)
@@ -137,7 +136,7 @@ class HamiltonianMonteCarlo(ChainEngine):
             raise ValueError(
                 f"{what}(marginalize={self.marginalize!r}): marginalize is True or False"
             )
-        if self.metric not in _METRICS:
+        if self.metric not in get_args(Metric):
             raise ValueError(
                 f'{what}(metric={self.metric!r}): metric is "auto", "diagonal" or "dense"'
             )
