@@ -521,7 +521,7 @@ def figures(
 
 
 def picks(
-    folder: Path, robots: Sequence[int] = (1, 2, 3, 4, 5), particles: int = 200
+    folder: Path, robots: Sequence[int] = (1, 2, 3, 4, 5), particles: int = 40
 ) -> Iterator[tuple[int, dict[str, float]]]:
     """Shares of readings assigned right where it is not known, beside those of who knows pose and map."""
     for k in robots:

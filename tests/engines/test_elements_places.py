@@ -12,10 +12,9 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.marginal.elements import step
 from bayesmc.engines.marginal.elements.places import linearised, moments
 from bayesmc.engines.marginal.elements.updates import Belief, Row, Tangent, conditioned, placed
-from bayesmc.robotics import AndAngle, PoseNormal, bearing, bearing_to, range_to
+from bayesmc.robotics import PoseNormal, bearing
 
 NOISE = 0.05
 
@@ -82,7 +81,7 @@ def test_one_number_leaves_its_moments(at: Any, mean: Any, scale: float, value: 
     assert (np.abs(np.log(own / sizes)) < 0.15).all()
     assert abs(log[0] - evidence) < 0.15
     assert log[0] == found.log_predictive(given[0])[0]
-    tangent, turned, holds, _ = placed(*given[:3])  # the fault that this would not let pass
+    tangent, turned, holds = placed(*given[:3])  # the fault that this would not let pass
     assert not holds.any()
     if np.hypot(*mean) > 0 and at is bearing_at:
         plain, _ = conditioned(given[0], turned, tangent)
@@ -140,61 +139,3 @@ def test_filters_place_a_mark_behind_the_mean_of_its_prior(mean: Any, proposal: 
     assert (np.abs(np.log(found.std("mark")[0, 1] / sizes)) < 0.15).all()
     assert abs(found.log_marginal_likelihood - evidence) < 0.2
     np.testing.assert_allclose(found.mean("mark")[0, 0], mean)
-
-
-def picking(clutter: float) -> bmc.DynamicBayesNet:
-    """Four marks about a robot that knows where it is; a range and a bearing of one of them, or of none."""
-    dbn = bmc.DynamicBayesNet(plates={"mark": 4})
-    start = PoseNormal(np.zeros(3), scale_diag=[1e-3] * 3)
-    places = [[4.0, 0.0], [-3.0, 0.5], [-3.0, 1.0], [0.0, -5.0]]
-    dbn.add("pose", lambda pose_prev: PoseNormal(pose_prev, scale_diag=[1e-3] * 3), initial=start)
-    dbn.add(
-        "mark",
-        lambda mark_prev: bmc.MvNormal(mark_prev, scale_diag=np.zeros(2)),
-        plates="mark",
-        initial=lambda: bmc.MvNormal(places, scale_diag=[0.15, 0.15]),
-    )
-    dbn.add("which", bmc.Categorical([*[(1 - clutter) / 4] * 4, clutter]))
-
-    @dbn.node
-    def seen(pose, mark, which):
-        none, own = which == 4, mark[np.minimum(which, 3)]
-        far, angle = range_to(pose, own), bearing_to(pose, own)
-        return AndAngle(
-            bmc.Normal(np.where(none, 4.0, far), np.where(none, 3.0, 0.05)),
-            bmc.WrappedNormal(np.where(none, 0.0, angle), np.where(none, 2.0, 0.01)),
-        )
-
-    return dbn
-
-
-PICKED = [[3.9, 0.01], [3.1, 2.95], [3.2, 2.8], [5.0, -1.5], [8.0, 0.7]]
-
-
-def picked(clutter: float, rows: Any) -> Any:
-    engine = bmc.ParticleFilter(20, marginalize="mark")
-    return bmc.filter(picking(clutter), {"seen": rows}, engine=engine, rng=0)
-
-
-def test_picks_out_of_reach_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who looks for the mode of every pick answers the same; who looks for none farther than .3 does not."""
-    found = picked(0.1, PICKED)
-    monkeypatch.setattr(step, "_REACH", np.inf)
-    np.testing.assert_allclose(found.mean("mark"), picked(0.1, PICKED).mean("mark"), atol=1e-9)
-    monkeypatch.setattr(step, "_REACH", 0.3)
-    assert np.abs(found.mean("mark") - picked(0.1, PICKED).mean("mark")).max() > 1e-6
-
-
-def test_a_reading_out_of_reach_of_all_picks_is_worked_out_in_full(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    rows = [[3.9, 0.01], [8.0, 0.7]]  # the second is 20 standard deviations from any
-    found = picked(0.0, rows)
-    monkeypatch.setattr(step, "_REACH", np.inf)
-    full = picked(0.0, rows)
-    np.testing.assert_allclose(found.mean("mark"), full.mean("mark"), atol=1e-9)
-    assert found.log_marginal_likelihood == pytest.approx(full.log_marginal_likelihood, abs=1e-9)
-    monkeypatch.setattr(step, "_REACH", 14.0)
-    monkeypatch.setattr(step, "_leaves_none", lambda *_: False)
-    left = picked(0.0, rows)
-    assert abs(left.log_marginal_likelihood - full.log_marginal_likelihood) > 1e-3

@@ -137,7 +137,7 @@ def test_few_numbers_move_jointly_and_many_by_slices() -> None:
 
 
 def test_plates_that_share_terms_move_jointly_and_one_alone_by_slices() -> None:
-    """Components of a declared mixture: means and scales hang together, whichever node comes first."""
+    """Components of a declared mixture hang together, whichever node comes first; pairs of a row by themselves."""
     net = bmc.BayesNet(plates={"part": 2, "row": 50, "lone": 3})
     net.add("mu", bmc.Normal(0.0, 2.0), plates="part")
     net.add("sigma", bmc.HalfNormal(2.0), plates="part")
@@ -148,11 +148,12 @@ def test_plates_that_share_terms_move_jointly_and_one_alone_by_slices() -> None:
         plates="row",
     )
     net.add("heavy", bmc.StudentT(4.0, 0.0, 1.0), plates="lone")
-    net.add("z", lambda heavy: bmc.StudentT(4.0, heavy, 1.0), plates="lone")
+    net.add("wide", bmc.HalfCauchy(1.0), plates="lone")
+    net.add("z", lambda heavy, wide: bmc.StudentT(4.0, heavy, wide), plates="lone")
     evidence = {"y": np.linspace(-2.0, 2.0, 50), "z": [0.1, 0.5, -0.3]}
     table = {row.node: row for row in bmc.explain(net, evidence, engine=bmc.Gibbs()).table}
     assert all("5 free numbers jointly" in table[n].why for n in ("mu", "sigma", "shares"))
-    assert table["heavy"].kernel.startswith("slice")
+    assert all(table[n].kernel.startswith("slice") for n in ("heavy", "wide"))
 
 
 def test_the_reason_of_a_refusal_is_told(capsys: pytest.CaptureFixture) -> None:

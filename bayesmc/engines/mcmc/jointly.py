@@ -11,6 +11,7 @@ from bayesmc.kernels.base import ANYHOW, How
 from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import fitting
 from bayesmc.network import Problem
+from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.jumps import jumps
 from bayesmc.structure.summing import components
@@ -88,7 +89,8 @@ def trajectories_of(
 ) -> list[Hamiltonian]:
     """Kernels of nodes without a closed form that move better together than one at a time.
 
-    That is so up to `DENSE` numbers. Of more that share terms, the larger
+    That is so up to `DENSE` numbers that share terms; plates join each other where their elements do so among
+    themselves, too. Of more that share terms, the larger
     nodes are left to slices, which move all elements of a plate at once; vectors, which slices move number
     by number, are not. Many like nodes (slices of a template) count as one plate, and keep what shares terms
     with them. A node whose own density is another for each state of a hidden finite one is left out: no one
@@ -208,10 +210,19 @@ def _groups(target: Target, names: Sequence[str]) -> list[tuple[str, ...]]:
             if meets and _size(target, [*group, *merged]) <= DENSE:
                 merged = [*group, *merged]
                 groups.remove(group)
-        groups.append(merged)
+        if len(merged) > 1 or not model[name].plates or _is_coupled(target, name):
+            groups.append(merged)
     # the elements of one plate by themselves are moved at once by slices
     several = [g for g in groups if len(g) > 1 or not model[g[0]].plates]
     return [tuple(n for n in target.chain if n in g) for g in several if _size(target, g) > 1]
+
+
+def _is_coupled(target: Target, name: str) -> bool:
+    """Whether terms read several elements of a plate at once, as those of a mixture do of its components.
+
+    Elements that meet in no term are slices' affair: trajectories of all would take the shortest step of any.
+    """
+    return len(Blanket(target, name).classes) > 1
 
 
 def _joined(target: Target, group: tuple[str, ...], closed: Sequence[str]) -> tuple[str, ...]:

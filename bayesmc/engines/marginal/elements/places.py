@@ -57,8 +57,6 @@ class Linear(NamedTuple):
         For which ``after`` and ``log`` stand instead.
     after : Belief, or None
     log : ndarray, shape (batch,), or None
-    beyond : ndarray of bool, shape (batch,), or None
-        Whose mode lies beyond the reach that was asked for: next to these, others are far more likely.
     """
 
     tangent: Tangent
@@ -66,7 +64,6 @@ class Linear(NamedTuple):
     wild: np.ndarray | None = None
     after: Belief | None = None
     log: np.ndarray | None = None
-    beyond: np.ndarray | None = None
 
     def of(self, some: np.ndarray) -> Linear:
         """Of some of the batch."""
@@ -91,27 +88,14 @@ class Linear(NamedTuple):
         return log if self.wild is None or self.log is None else np.where(self.wild, self.log, log)
 
 
-def linearised(prior: Belief, row: Row, at: At, bent: bool, reach: float = np.inf) -> Linear:
-    """Rows made linear for beliefs; where no tangent holds, beliefs given them by their moments.
-
-    Parameters
-    ----------
-    prior : Belief
-        Of a batch.
-    row : Row
-    at : callable
-        Tangents at points, shape (some, n), of some of the batch.
-    bent : bool
-        Whether a tangent may not hold.
-    reach : float
-        Standard deviations of a belief beyond which its mode is not looked for.
-    """
+def linearised(prior: Belief, row: Row, at: At, bent: bool) -> Linear:
+    """Rows made linear for beliefs; where no tangent holds, beliefs given them by their moments."""
     if not bent:
         return Linear(*plain(prior, row, at))
-    found, turned, holds, beyond = placed(prior, row, at, reach)
+    found, turned, holds = placed(prior, row, at)
     wild = np.flatnonzero(~holds)
     if not len(wild) or not np.diagonal(found.noise, 0, -2, -1).all():
-        return Linear(found, turned, beyond=beyond)
+        return Linear(found, turned)
     mean, root = np.array(prior.mean), np.array(prior.root)
     log, is_wild = np.zeros(len(mean)), ~holds
     n = mean.shape[-1]
@@ -126,7 +110,7 @@ def linearised(prior: Belief, row: Row, at: At, bent: bool, reach: float = np.in
         after, log[own], lost = moments(some, row.of(own), at_own)
         mean[own], root[own] = after.mean, after.root
         is_wild[own[lost]] = False
-    return Linear(found, turned, is_wild, Belief(mean, root), log, beyond)
+    return Linear(found, turned, is_wild, Belief(mean, root), log)
 
 
 def moments(prior: Belief, row: Row, at: At) -> tuple[Belief, np.ndarray, np.ndarray]:

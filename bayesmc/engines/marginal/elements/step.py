@@ -33,9 +33,6 @@ from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.tables.step import Known
 from bayesmc.network import Observed
 
-#: standard deviations of a belief beyond which a pick has no share in a reading: less than exp(-98)
-_REACH = 14.0
-
 
 class ElementFilter:
     """The forward step of all elements of the particles of a template.
@@ -269,15 +266,14 @@ class ElementFilter:
                     return found
 
                 given = data.of(np.full(len(possible), r))
-                made = linearised(some, given, tangent, group.bent, _REACH)
-                if _leaves_none(made.beyond, possible, own):
-                    made = linearised(some, given, tangent, group.bent)
+                made = linearised(some, given, tangent, group.bent)
                 flat = joint.reshape(-1)
                 flat[possible] += made.log_predictive(some)
                 joint = flat.reshape(own.shape)
             level = log_sum_exp(joint, axis=1)
             np.add.at(log, (np.arange(n), self.group[at[:, 0]]), level)
-            picks[:, r] = chosen = _drawn(joint, rng)
+            chosen = _drawn(joint, rng)
+            picks[:, r] = chosen
             if made is not None:
                 flat = np.arange(n) * states + chosen
                 back = np.searchsorted(possible, flat)
@@ -389,16 +385,6 @@ def gathered(pool: Pool, at: np.ndarray, particles: int) -> tuple[Belief, Any]:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _leaves_none(beyond: np.ndarray | None, possible: np.ndarray, log_prior: np.ndarray) -> bool:
-    """Whether all possible picks of some particle are beyond reach; priors are (particles, states)."""
-    if beyond is None:
-        return False
-    left = np.zeros(log_prior.size, bool)
-    left[possible[~beyond]] = True
-    reached = left.reshape(log_prior.shape).any(axis=1)
-    return bool((~reached & (log_prior > -np.inf).any(axis=1)).any())
 
 
 def looking_none(places: np.ndarray, chosen: np.ndarray, reading: int) -> np.ndarray:

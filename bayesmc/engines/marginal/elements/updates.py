@@ -93,49 +93,34 @@ def plain(prior: Belief, row: Row, at: At) -> tuple[Tangent, Row]:
     return found, row.turned(found.mean)
 
 
-def placed(
-    prior: Belief, row: Row, at: At, reach: float = np.inf
-) -> tuple[Tangent, Row, np.ndarray, np.ndarray]:
+def placed(prior: Belief, row: Row, at: At) -> tuple[Tangent, Row, np.ndarray]:
     """Tangents at means of beliefs, or at modes where those do not hold; the row; whether tangents hold.
 
-    What tangents expect is at the means of the beliefs. The last array says whose mode lies beyond ``reach``
-    standard deviations of the belief: the row is so unlikely that the tangent where it was left has to do.
+    What tangents expect is at the means of the beliefs.
     """
-    beyond = np.zeros(len(prior.mean), bool)
     found, turned = plain(prior, row, at)
     holds = _holds(prior, row, turned, found, at)
     again = np.flatnonzero(~holds)
     if not len(again):
-        return found, turned, holds, beyond
+        return found, turned, holds
     some, own = Belief(prior.mean[again], prior.root[again]), row.of(again)
 
     def at_some(x: np.ndarray, which: np.ndarray) -> Tangent:
         return at(x, again[which])
 
-    z = mode(some, own, at_some, reach)
-    point = some.mean + np.matvec(some.root, z)
+    point = some.mean + np.matvec(some.root, mode(some, own, at_some))
     there = at_some(point, np.arange(len(again)))
     smooth = is_smooth(there, some.root)
     tangent = _masked(there, smooth)
     turned_there = own.turned(tangent.mean)
     tangent = expected_at(some, point, tangent)
-    beyond[again] = np.linalg.norm(z, axis=-1) > reach
-    near = np.flatnonzero(~beyond[again])
-    holds[again] = True
-    if len(near):
-        holds[again[near]] = smooth[near] & _holds(
-            Belief(some.mean[near], some.root[near]),
-            own.of(near),
-            turned_there.of(near),
-            Tangent(*(part[near] for part in tangent)),
-            lambda x, which: at(x, again[near[which]]),
-        )
+    holds[again] = smooth & _holds(some, own, turned_there, tangent, at_some)
     value = np.array(turned.value)
     value[again] = turned_there.value
     parts = [np.array(a) for a in found]
     for whole, part in zip(parts, tangent, strict=True):
         whole[again] = part
-    return Tangent(*parts), turned._replace(value=value), holds, beyond
+    return Tangent(*parts), turned._replace(value=value), holds
 
 
 def conditioned(prior: Belief, row: Row, found: Tangent) -> tuple[Belief, np.ndarray]:
@@ -264,11 +249,8 @@ def _step(prior: Belief, row: Row, point: np.ndarray, found: Tangent) -> np.ndar
     return np.linalg.solve(turned @ scaled + np.eye(n), np.matvec(turned, off)[..., None])[..., 0]
 
 
-def mode(prior: Belief, row: Row, at: At, reach: float = np.inf) -> np.ndarray:
-    """Modes of beliefs given rows, in standard normals of beliefs, shape (batch, n).
-
-    Who comes to lie beyond ``reach`` stays there.
-    """
+def mode(prior: Belief, row: Row, at: At) -> np.ndarray:
+    """Modes of beliefs given rows, in standard normals of beliefs, shape (batch, n)."""
     count, n = prior.mean.shape
     every = np.arange(count)
 
@@ -299,7 +281,6 @@ def mode(prior: Belief, row: Row, at: At, reach: float = np.inf) -> np.ndarray:
         if not len(going):
             break
         going = going[_moved(prior, row, going, best, tangent, found_at)]
-        going = going[np.linalg.norm(best[going], axis=-1) <= reach]
     return best
 
 
