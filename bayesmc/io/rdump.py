@@ -33,6 +33,7 @@ _TOKEN = re.compile(
 )
 _CONSTANTS = {"NA": np.nan, "NaN": np.nan, "Inf": np.inf, "TRUE": True, "FALSE": False,
               "T": True, "F": False, "NA_real_": np.nan, "NA_integer_": np.nan}  # fmt: skip
+_RESERVED = _CONSTANTS.keys() - {"T", "F"}
 _EMPTY = {"integer": np.int64, "numeric": np.float64, "double": np.float64, "logical": np.bool_}
 #: conversions that older versions of R write around values, and ``as.vector``, which drops dimensions
 _AS = ("as.integer", "as.numeric", "as.double", "as.logical", "as.vector")
@@ -146,6 +147,8 @@ class _Reader:
         if name is None:
             self._fail("an entry of the list has no name")
         assert name is not None
+        if name in _RESERVED:
+            self._fail(f"{name!r} is a word of R, and no name")
         if name in found:
             self._fail(f"{name!r} is given twice")
         found[name] = np.asarray(value)
@@ -194,7 +197,7 @@ class _Reader:
         while self.now.text in "+-" and self.now.kind == "mark":
             sign *= -1 if self._next().text == "-" else 1
         value = self._single()
-        return value if sign == 1 else -value
+        return value if sign == 1 else -1 * value
 
     def _single(self) -> Any:
         token = self._next()
@@ -203,7 +206,7 @@ class _Reader:
         if token.kind == "name" and self.now.text == "(":
             return self._call(token)
         if token.kind == "name" and token.text in self.found and not self.is_list:
-            return self.found[token.text]
+            return np.array(self.found[token.text])
         if token.kind == "name" and token.text in _CONSTANTS:
             return _CONSTANTS[token.text]
         self.at -= token.kind != "end"

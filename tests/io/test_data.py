@@ -78,13 +78,34 @@ def test_numbers_of_r(text: str, wanted: dict) -> None:
             {"y": [[np.nan, np.nan]], "z": [[[1, 3]], [[2, 4]]]},
         ),
         ('y <- matrix(0, 1, 2, dimnames = list(NULL, c("a", "b")))', {"y": [[0, 0]]}),
+        (
+            "y <- seq(to = 5, length.out = 3)\nz <- seq(to = 10, by = 2, len = 3)",
+            {"y": [3, 4, 5], "z": [6, 8, 10]},
+        ),
+        (
+            "y <- seq(5, by = -2)\nz <- seq(0)\nw <- seq(-2)",
+            {"y": [5, 3, 1], "z": [1, 0], "w": [1, 0, -1, -2]},
+        ),
+        ("y <- seq(0, 0.3, by = 0.1)", {"y": [0, 0.1, 0.2, 0.3]}),
+        ("y <- seq(0, 1, length.out = 2.5)\nz <- seq(2, 2, by = 0)", {"y": [0, 0.5, 1], "z": [2]}),
+        ("y <- seq(c(4, 7, 9))\nb <- TRUE\nz <- -b", {"y": [1, 2, 3], "b": 1, "z": -1}),
     ],
 )
 def test_what_people_write_by_hand(text: str, wanted: dict) -> None:
     found = parse_rdump(text)
     assert list(found) == list(wanted)
     for name, value in wanted.items():
-        np.testing.assert_array_equal(found[name], value)
+        np.testing.assert_allclose(found[name], value, rtol=1e-15)
+
+
+def test_the_last_number_of_a_sequence_is_not_passed() -> None:
+    assert parse_rdump("y <- seq(0, 0.3, by = 0.1)")["y"][-1] == 0.3
+
+
+def test_a_copy_of_a_name_is_an_array_of_its_own() -> None:
+    found = parse_rdump("x <- c(1, 2)\ny <- x")
+    found["x"][0] = 7
+    assert found["y"].tolist() == [1, 2]
 
 
 def test_cubes_run_by_the_first_index_in_r_and_by_the_last_in_bugs() -> None:
@@ -111,6 +132,16 @@ def test_cubes_run_by_the_first_index_in_r_and_by_the_last_in_bugs() -> None:
         ("y <- rep(1, each = 2, each = 2)", 1, "is given 'each' twice"),
         ("y <- seq(1, 5, by = -1)", 1, "does not get from 1 to 5 by -1"),
         ("y <- seq(c(1, 2), 5)", 1, "seq(...) takes single numbers"),
+        ("y <- seq(5, by = 2)", 1, "does not get from 5 to 1 by 2"),
+        ("y <- seq(1, 10, by = 2, length.out = 3)", 1, "three of from, to, by and length.out"),
+        ("\ny <- rep(0, 1e12)", 2, "rep(...) makes 1e+12 numbers"),
+        ("y <- rep(0, 1e300)", 1, "rep(...) makes 1e+300 numbers"),
+        ("y <- rep(c(1, 2), each = 1e8)", 1, "rep(...) makes 2e+08 numbers"),
+        ("y <- seq(0, 1e12)", 1, "seq(...) makes 1e+12 numbers"),
+        ("y <- array(0, dim = c(1e10, 1e10))", 1, "array(...) makes 1e+10 numbers"),
+        ("y <- matrix(0, 1e8, 1e8)", 1, "matrix(...) makes 1e+16 numbers"),
+        ("y <- matrix(0, 2, 2, byrow = c(T, F))", 1, "byrow is TRUE or FALSE"),
+        ("NA <- 3", 1, "'NA' is a word of R"),
         ("y <- matrix(c(), 2, 2)", 1, "no values to fill 4 places with"),
         ("y <- later\nlater <- 2", 1, "'later' is no number, and nothing before gives it one"),
         ("list(N = 3, y = c(N))", 1, "'N' is no number"),
