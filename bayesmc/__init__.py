@@ -5,6 +5,7 @@ distribution. See ``bayesmc.BayesNet`` and ``bayesmc.infer``.
 """
 
 import importlib
+import threading
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
@@ -196,7 +197,8 @@ __all__ = [
 
 
 #: rooms that load when first asked for, as not every program needs them
-_ROOMS = ("io", "markov", "montecarlo", "plotting", "robotics", "sklearn", "testing", "vision")
+_ROOMS = ("auto", "engines", "io", "learning", "markov", "montecarlo", "plotting", "pmcmc", "robotics",
+          "sklearn", "testing", "vision")  # fmt: skip
 #: module -> its names that load it when first asked for, so that an import alone is quick: what asks and
 #: answers is two thirds of the package. Type checkers read the same names above.
 _WHERE = {
@@ -241,16 +243,20 @@ _WHERE = {
 }
 _MODULES = {name: module for module, names in _WHERE.items() for name in names}
 
+#: threads that enter packages from two ends at once would meet half of a module
+_LOADING = threading.RLock()
+
 
 def __getattr__(name: str) -> Any:
     """Loads the module behind a name that is asked for the first time (PEP 562)."""
-    if name in _ROOMS:
-        return importlib.import_module(f"bayesmc.{name}")
-    if name not in _MODULES:
-        raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")
-    found = getattr(importlib.import_module(f"bayesmc.{_MODULES[name]}"), name)
-    globals()[name] = found
-    return found
+    with _LOADING:
+        if name in _ROOMS:
+            return importlib.import_module(f"bayesmc.{name}")
+        if name not in _MODULES:
+            raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")
+        found = getattr(importlib.import_module(f"bayesmc.{_MODULES[name]}"), name)
+        globals()[name] = found
+        return found
 
 
 def __dir__() -> list[str]:

@@ -327,6 +327,31 @@ def test_names_that_load_later_are_those_of_type_checkers() -> None:
         bayesmc.KalmanFiler  # noqa: B018
 
 
+def test_threads_may_name_engines_at_once() -> None:
+    """Packages entered from two ends, each by a thread that waits for the other, were half loaded."""
+    code = """
+import sys, threading, bayesmc
+sys.setswitchinterval(1e-5)
+names = ("infer Gibbs ParticleFilter fit Fit map ParticleGibbs io ParticleBelief Exact "
+         "KalmanFilter ExpectationPropagation LaplaceApproximation GridFilter engines MeanField").split()
+barrier, failed = threading.Barrier(len(names)), []
+def named(name):
+    barrier.wait()
+    try:
+        getattr(bayesmc, name)
+    except BaseException as error:
+        failed.append(f"{name}: {error!r}")
+threads = [threading.Thread(target=named, args=(n,)) for n in names]
+for t in threads: t.start()
+for t in threads: t.join()
+print(failed)
+"""
+    for _ in range(3):
+        found = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, text=True,
+                               capture_output=True, check=True)  # fmt: skip
+        assert found.stdout.strip() == "[]"
+
+
 def _loaded_by(statement: str) -> set[str]:
     """Modules that a fresh interpreter has after a statement."""
     code = f"import json, sys\n{statement}\nprint(json.dumps(sorted(sys.modules)))"

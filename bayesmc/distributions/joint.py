@@ -43,6 +43,8 @@ class Joint(Distribution):
     """
 
     splits = True
+    #: the arguments are the parts, in order, and there is nothing else: each class says so for itself
+    parts_as_given = True
 
     def __init__(self, *parts: Any) -> None:
         self.parts = tuple(_usable(part) for part in _listed(parts))

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -27,6 +27,7 @@ from bayesmc.expression import Constant, Expression, Family, TracedArray, as_exp
 from bayesmc.expression.composed import log_sum_exp
 from bayesmc.expression.graph import cast
 from bayesmc.passes.interval_mass import log_mass
+from bayesmc.passes.joints import VECTORS, is_joint, places
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -126,10 +127,10 @@ def _kernels(dist: d.KernelDensity) -> Family:
 
 def _log_density(family: Family, x: Any) -> Any:
     form = _FORMS.get(family.make)
-    if isinstance(family.make, type) and issubclass(family.make, d.Joint):
-        return _joint(x, family)
     if form is None and has_own_form(family):
         return _own_form(family, x)
+    if is_joint(family):
+        return _joint(x, family)
     if form is None:
         name = getattr(family.make, "__name__", str(family.make))
         raise TraceError(f"no closed log density of {name} is known to derivatives")
@@ -384,29 +385,16 @@ def _mixture(x: Any, weights: Any, components: Any) -> Any:
     elif _part(components).make in _MATRICES:
         raise TraceError("no closed log density of a mixture of matrices is known to derivatives")
     else:
-        is_vector = _part(components).make in _VECTORS
+        is_vector = _part(components).make in VECTORS
         parts = _log_density(_part(components), x[..., None, :] if is_vector else x[..., None])
     return log_sum_exp(logs + parts, axis=-1)
 
 
 def _joint(x: Any, family: Family) -> Any:
-    total, at = 0.0, 0
-    for part in _side_by_side(family):
-        known = (v for v in part.parameters.values() if isinstance(v, Expression) and v.shape)
-        size = next(known).shape[-1] if part.make in _VECTORS else 0
-        total = total + _log_density(part, x[..., at : at + size] if size else x[..., at])
-        at += max(size, 1)
+    total = 0.0
+    for part, at in places(family, _part):
+        total = total + _log_density(part, x[..., at])
     return total
-
-
-def _side_by_side(family: Family) -> Iterator[Family]:
-    """The parts of a joint, those of parts that are joints themselves in their place."""
-    if not (isinstance(family.make, type) and issubclass(family.make, d.Joint)):
-        yield family
-        return
-    parts = list(family.parameters.get("parts", family.parameters.values()))
-    for part in parts[0] if isinstance(parts[0], (list, tuple)) else parts:
-        yield from _side_by_side(_part(part))
 
 
 def _affine(x: Any, base: Any, loc: Any, scale: Any) -> Any:
@@ -432,7 +420,6 @@ def _truncated(x: Any, base: Any, low: Any, high: Any) -> Any:
 #: scale from which on a Fourier series has few terms
 _FOURIER = 1.25
 _MATRICES = frozenset((d.Wishart, d.InverseWishart))
-_VECTORS = frozenset((d.MvNormal, d.Dirichlet, d.Multinomial))
 
 _FORMS: Mapping[Any, Callable[..., Any]] = {
     d.Normal: _normal, d.MvNormal: _mv_normal, d.StudentT: _student_t, d.Laplace: _laplace,

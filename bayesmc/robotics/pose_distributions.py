@@ -176,6 +176,8 @@ class AndAngle(Joint):
     ((5, 3), -5.0159)
     """
 
+    parts_as_given = True
+
     def __init__(self, part: Any, angle: Any) -> None:
         super().__init__(part)
         last = as_distribution(angle)

@@ -139,3 +139,27 @@ def test_filters_place_a_mark_behind_the_mean_of_its_prior(mean: Any, proposal: 
     assert (np.abs(np.log(found.std("mark")[0, 1] / sizes)) < 0.15).all()
     assert abs(found.log_marginal_likelihood - evidence) < 0.2
     np.testing.assert_allclose(found.mean("mark")[0, 0], mean)
+
+
+def test_a_flat_reading_is_of_the_element_that_explains_it() -> None:
+    """tanh tells nothing far out: a tangent there would say that what is read was expected.
+
+    Element 1.2 +- .3 has tanh(x) = -.98 at twelve standard deviations; -1.6 +- .3 is near it.
+    """
+    dbn = bmc.DynamicBayesNet(plates={"mark": 2})
+    dbn.add(
+        "mark",
+        lambda mark_prev: bmc.Normal(mark_prev, 0.0),
+        plates="mark",
+        initial=lambda: bmc.Normal(np.array([1.2, -1.6]), 0.3),
+    )
+    dbn.add("which", bmc.Categorical([0.5, 0.5]))
+    dbn.add("seen", lambda mark, which: bmc.Normal(np.tanh(mark[which]), 0.05))
+    engine = bmc.ParticleFilter(200, marginalize="mark")
+    found = bmc.filter(dbn, {"seen": [-0.983]}, engine=engine, rng=0)
+    x = np.linspace(-6.0, 6.0, 200_001)
+    like = bmc.Normal(np.tanh(x), 0.05).log_prob(-0.983)
+    each = [np.trapezoid(np.exp(like + bmc.Normal(m, 0.3).log_prob(x)), x) for m in (1.2, -1.6)]
+    assert each[0] < 1e-12 * each[1]
+    assert found.mean("which")[0] == 1.0
+    assert abs(found.log_marginal_likelihood - np.log(0.5 * sum(each))) < 0.1

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.errors import TraceError
 from bayesmc.expression import Family, Program, TracedArray, constant, leaf, reduction, trace
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.log_density import log_density
@@ -147,3 +148,45 @@ def test_student_t_of_many_degrees_is_the_normal_density() -> None:
     (found,) = Program([log_density(shown, leaf("x", (6,), float))])({"df": df, "x": x})
     np.testing.assert_allclose(found, bmc.StudentT(df, 0.5, 2.0).log_prob(x), rtol=1e-10)
     np.testing.assert_allclose(found[3:], bmc.Normal(0.5, 2.0).log_prob(x[3:]), rtol=1e-9)
+
+
+class Turned(bmc.Joint):
+    """A joint whose arguments are its parts the other way round."""
+
+    def __init__(self, first, second):
+        super().__init__(second, first)
+
+
+class Summed(bmc.Joint):
+    """One with a form of its own, whose arguments are numbers."""
+
+    parameter_ndim = {"low": 0, "high": 0}
+
+    def __init__(self, low, high):
+        self.low, self.high = low, high
+        super().__init__(bmc.Normal(low, 1.0), bmc.Normal(high, 1.0))
+
+    @staticmethod
+    def log_density(x, low, high):
+        squares = np.square(x[..., 0] - low) + np.square(x[..., 1] - high)
+        return -0.5 * squares - np.log(2 * np.pi)
+
+
+def test_a_class_that_extends_a_joint_is_not_taken_for_its_arguments():
+    read_as = lambda f: log_density(trace(f, [TracedArray(leaf("a", ()))]), leaf("x", (2,)))  # noqa: E731
+    with pytest.raises(TraceError, match="Turned"):
+        read_as(lambda a: Turned(bmc.Normal(a, 1.0), bmc.Gamma(2.0, 1.0)))
+    (found,) = Program([read_as(lambda a: Summed(a, a + 1))])({"a": 0.5, "x": [2.0, 3.0]})
+    assert found == pytest.approx(Summed(0.5, 1.5).log_prob([2.0, 3.0]))
+
+
+def test_a_part_of_unknown_size_is_refused():
+    vectors = bmc.Mixture(
+        [0.3, 0.7], [bmc.MvNormal([0.0, 1.0], COV), bmc.MvNormal([1.0, 0.0], COV)]
+    )
+    for part in (vectors, bmc.Affine(bmc.MvNormal([0.0, 1.0], COV), 1.0, 2.0)):
+        family = trace(
+            lambda a, p=part: bmc.Joint(p, bmc.Normal(a, 1.0)), [TracedArray(leaf("a", ()))]
+        )
+        with pytest.raises(TraceError, match="of vectors"):
+            log_density(family, leaf("x", (3,)))
