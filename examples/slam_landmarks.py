@@ -403,12 +403,12 @@ def looked_back(
     On the way of one particle, in turn until nothing changes: the map given whose each reading is, and
     whose it most probably is given the map. Each step makes the posterior of both larger.
     """
-    numbers = numbers.copy()
+    marks = marks_on(poses, numbers, readings)
     for _ in range(rounds):
-        marks = marks_on(poses, numbers, readings)
         before, numbers = numbers, most_probable(poses, marks, readings, np.unique(numbers))
         if (numbers == before).all():
             break
+        marks = marks_on(poses, numbers, readings)
     return numbers, marks
 
 

@@ -50,7 +50,7 @@ from bayesmc.passes.reads import NOTHING, element_read, matrix_function, reads, 
 Feature = float | str
 LOG, LOG1M, CONSTANT = "log x", "log(1 - x)", 0.0
 Features = dict[Feature, Expression]
-#: powers beyond which nobody looks for a family: a polynomial is twice as long after each product
+#: powers beyond which no product is worked out for a family: it may be twice as long as what is multiplied
 _MOST = 16
 
 

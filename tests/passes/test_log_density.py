@@ -176,7 +176,9 @@ def test_a_class_that_extends_a_joint_is_not_taken_for_its_arguments():
     read_as = lambda f: log_density(trace(f, [TracedArray(leaf("a", ()))]), leaf("x", (2,)))  # noqa: E731
     with pytest.raises(TraceError, match="Turned"):
         read_as(lambda a: Turned(bmc.Normal(a, 1.0), bmc.Gamma(2.0, 1.0)))
-    (found,) = Program([read_as(lambda a: Summed(a, a + 1))])({"a": 0.5, "x": [2.0, 3.0]})
+    (found,) = Program([read_as(lambda a: Summed(a, a + 1))])(
+        {"a": np.array(0.5), "x": np.array([2.0, 3.0])}
+    )
     assert found == pytest.approx(Summed(0.5, 1.5).log_prob([2.0, 3.0]))
 
 
