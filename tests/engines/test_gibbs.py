@@ -137,7 +137,7 @@ def test_few_numbers_move_jointly_and_many_by_slices() -> None:
 
 
 def test_plates_that_share_terms_move_jointly_and_one_alone_by_slices() -> None:
-    """Components of a declared mixture hang together, whichever comes first; pairs in rows of their own do not."""
+    """Components of a declared mixture hang together, whichever comes first; rows by themselves do not."""
     net = bmc.BayesNet(plates={"part": 2, "row": 50, "lone": 3})
     net.add("mu", bmc.Normal(0.0, 2.0), plates="part")
     net.add("sigma", bmc.HalfNormal(2.0), plates="part")
