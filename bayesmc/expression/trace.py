@@ -423,7 +423,7 @@ def _changing(name: str, value: Any, read: tuple[str, ...]) -> str | None:
             return "it draws random numbers"
     if isinstance(value, (np.random.Generator, np.random.RandomState)):
         return f"it draws random numbers from {name}"
-    if _room(value) in _CHANGING and callable(value):
+    if callable(value) and _room(value) in _CHANGING:
         return f"it calls {name}, which another call finds changed"
     return None
 

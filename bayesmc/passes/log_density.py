@@ -127,14 +127,14 @@ def _kernels(dist: d.KernelDensity) -> Family:
 
 def _log_density(family: Family, x: Any) -> Any:
     form = _FORMS.get(family.make)
-    if form is None and has_own_form(family):
+    if form is not None:
+        return form(x, **{k: _stand_in(v) for k, v in family.parameters.items()})
+    if has_own_form(family):
         return _own_form(family, x)
     if is_joint(family):
         return _joint(x, family)
-    if form is None:
-        name = getattr(family.make, "__name__", str(family.make))
-        raise TraceError(f"no closed log density of {name} is known to derivatives")
-    return form(x, **{k: _stand_in(v) for k, v in family.parameters.items()})
+    name = getattr(family.make, "__name__", str(family.make))
+    raise TraceError(f"no closed log density of {name} is known to derivatives")
 
 
 def _own_form(family: Family, x: Any) -> Any:
