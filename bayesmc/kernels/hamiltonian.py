@@ -23,6 +23,7 @@ from bayesmc.kernels.hamiltonian_warmup import (
     fitting,
     windows,
 )
+from bayesmc.kernels.lost_chains import LostChains
 from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, Transition, transition
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.free_density import UnconstrainedDensity
@@ -132,6 +133,7 @@ class Hamiltonian(Kernel):
         #: a warmup whose length is said learns for the acceptance that is said
         self.bends = Bends() if warmup is None else None
         self.metric = MetricLearning(fitting(metric, density.size))
+        self.lost = LostChains()
         self.ends, self.beginning = windows(warmup)
 
     def expect(self, steps: int, chains: int) -> None:
@@ -159,6 +161,7 @@ class Hamiltonian(Kernel):
             "place": {"u": u, "log": log, "slope": slope},
             "values": {n: values[n] for n in self.density.names},
             "metric": self.metric.start(slope),
+            "lost": self.lost.start(*u.shape),
             "step": self.step_size.start(np.zeros(chains)),
             "machine": self._compiled is not None,
             "sweep": 0,
@@ -193,7 +196,8 @@ class Hamiltonian(Kernel):
         kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
         kept["work"] = memory["work"] + np.array([found.calls, found.points])
         if warmup:
-            return new, self._learnt(gradient, place, kept, found.acceptance, rng)
+            kept = self._learnt(gradient, place, kept, found.acceptance, rng)
+            return kept["values"], kept
         kept["divergences"] = kept["divergences"] + found.divergent
         kept["saturated"] = kept["saturated"] + (found.depth == self.max_depth)
         kept["energy"] = _with_energy(kept["energy"], found.energy, kept["moves"])
@@ -297,7 +301,10 @@ class Hamiltonian(Kernel):
         acceptance: np.ndarray,
         rng: np.random.Generator,
     ) -> Memory:
-        """The memory after a sweep of the warmup: the step always, the metric within windows."""
+        """The memory after a sweep of the warmup: the step always, the metric within windows.
+
+        Chains that are lost at the end of a window have other values then.
+        """
         sweep, pooled = memory["sweep"] + 1, self._is_pooled(memory)
         memory = {**memory, "sweep": sweep}
         memory["step"] = self.step_size.learnt(memory["step"], acceptance, pooled)
@@ -306,11 +313,28 @@ class Hamiltonian(Kernel):
         memory["metric"] = self.metric.learnt(memory["metric"], place.u, place.slope)
         if pooled:
             memory = self._bent(memory)
+            memory["lost"] = self.lost.seen(memory["lost"], place.u, place.log)
         if sweep < self.ends[memory["windows"]]:
             return memory
-        memory["metric"] = self.metric.renewed(memory["metric"])
         memory["windows"] += 1
+        lost = self.lost.found(memory["lost"])
+        memory["lost"] = self.lost.start(*place.u.shape)
+        if lost.any() and not self.given:
+            place, memory = self._found_again(place, memory, lost, rng)
+        else:
+            memory["metric"] = self.metric.renewed(memory["metric"])
         return self._first_steps(gradient, place, memory, rng, self._is_pooled(memory))
+
+    def _found_again(
+        self, place: Place, memory: Memory, lost: np.ndarray, rng: np.random.Generator
+    ) -> tuple[Place, Memory]:
+        """Lost chains go on among the others, and the window that they have part in tells nothing."""
+        rows = self.lost.moved(lost, rng)
+        place = Place(*(a[rows] for a in place))
+        values = {n: memory["values"][n][rows] for n in self.density.names}
+        metric = self.metric.emptied(memory["metric"])
+        moved = {"place": place._asdict(), "values": values, "metric": metric}
+        return place, {**memory, **moved, "raised": memory["windows"]}
 
     def _is_pooled(self, memory: Memory) -> bool:
         """Whether all chains take the same step: after the beginning, which a short warmup is all of."""

@@ -300,6 +300,10 @@ class MetricLearning:
                 pass
         return {**memory, "root": root if np.isfinite(root).all() else before, **empty}
 
+    def emptied(self, memory: dict[str, Any]) -> dict[str, Any]:
+        """The memory with the metric as it is, and a new window."""
+        return {**memory, **self._empty(*memory["draws"]["mean"].shape)}
+
     def _empty(self, chains: int, size: int) -> dict[str, Any]:
         def sums(*shape: int) -> dict[str, np.ndarray]:
             return {"mean": np.zeros((chains, size)), "square": np.zeros(shape)}

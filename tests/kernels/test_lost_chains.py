@@ -1,0 +1,107 @@
+"""Chains in modes that weigh nothing go on among the others; modes that weigh something keep their chains.
+
+Windows are of independent draws of Normal modes, whose true weights are known; the runs at the end are
+judged at 4.9 standard errors, a false alarm in a million for each figure. Planted faults are seen.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.errors import ConvergenceWarning
+from bayesmc.kernels.lost_chains import LostChains
+from bayesmc.testing import session
+
+SHIFT = session.seed()
+
+
+def window(
+    heights: list[float], widths: list[float], size: int = 5, count: int = 50, rise: float = 0.0
+) -> np.ndarray:
+    """Which chains are lost, each in a Normal mode of its own; the last one rises by so much."""
+    rng, lost = np.random.default_rng(7 + SHIFT), LostChains()
+    chains = len(heights)
+    memory = lost.start(chains, size)
+    for t in range(count):
+        z = rng.standard_normal((chains, size))
+        log = np.array(heights) - 0.5 * np.square(z).sum(axis=1)
+        log[-1] += rise * (t / count - 1.0)
+        memory = lost.seen(memory, z * np.array(widths)[:, None], log)
+    return lost.found(memory)
+
+
+def test_a_low_mode_is_lost_and_a_light_one_is_not() -> None:
+    far = window([0, 0, 0, -60.0], [1, 1, 1, 1])
+    assert far.tolist() == [False, False, False, True]
+    assert not window([0, 0, 0, -15.0], [1, 1, 1, 1]).any()
+
+
+def test_most_chains_may_be_lost() -> None:
+    found = window([0.0] * 2 + [-60.0] * 6, [1] * 8)
+    assert found.tolist() == [False] * 2 + [True] * 6
+    assert not window([0.0] + [-60.0] * 7, [1] * 8).any()  # one chain alone is no witness
+
+
+def test_a_spike_outweighs_nobody_and_width_makes_up_for_height() -> None:
+    thin = np.exp(-12.0)
+    assert not window([60.0, 60.0, 0, 0], [thin, thin, 1, 1]).any()  # equal weights
+    assert not window([75.0, 75.0, 0, 0], [thin**2, thin**2, 1, 1]).any()  # the low ones weigh all
+    assert window([160.0, 160.0, 0, 0], [thin, thin, 1, 1]).tolist() == [False, False, True, True]
+
+
+def test_chains_on_their_way_and_windows_of_few_draws_are_left() -> None:
+    heights = [0.0, 0, 0, -40.0]
+    assert window(heights, [1] * 4, rise=2.0)[-1]
+    assert not window(heights, [1] * 4, rise=60.0)[-1]
+    assert not window(heights, [1] * 4, count=39).any()
+    assert not window([0.0, -60.0], [1, 1]).any()
+
+
+@pytest.mark.parametrize("size", [1, 10, 200])
+def test_chains_of_one_mode_are_never_lost(size: int) -> None:
+    assert not window([0.0] * 64, [1.0] * 64, size=size).any()
+
+
+def test_a_lost_chain_goes_on_from_one_that_is_not() -> None:
+    rng, lost = np.random.default_rng(SHIFT), LostChains()
+    rows = lost.moved(np.array([False, True, False, True, True]), rng)
+    assert rows[[0, 2]].tolist() == [0, 2] and set(rows[[1, 3, 4]]) <= {0, 2}
+
+
+def two_modes(depth: float, width: float) -> bmc.BayesNet:
+    """A number with a mode at 30, of scale 1, and one at -30 whose height is lower by ``depth``."""
+    net = bmc.BayesNet("two modes")
+    net.add("x", lambda: bmc.Normal(0.0, 30.0))
+
+    def modes(x):
+        high, low = -0.5 * (x - 30.0) ** 2, -0.5 * ((x + 30.0) / width) ** 2 - depth
+        top = np.maximum(high, low)
+        return top + np.log(np.exp(high - top) + np.exp(low - top))
+
+    net.potential("modes", modes)
+    return net
+
+
+def answer(depth: float, width: float) -> np.ndarray:
+    start = {"x": np.repeat([-30.0, 30.0], 16)}
+    engine = bmc.HamiltonianMonteCarlo(chains=32, warmup=400, draws=200, start=start)
+    net = two_modes(depth, width)
+    return bmc.infer(net, engine=engine, rng=np.random.default_rng(3 + SHIFT))["x"]
+
+
+def test_an_answer_is_of_the_mode_that_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    draws = answer(depth=60.0, width=1.0)
+    mean = 30.0 * 900 / 901  # of the mode beside the prior
+    error = 1.0 / np.sqrt(draws.size / 10)  # far fewer independent ones than there are
+    assert abs(draws.mean() - mean) < 4.9 * error and draws.min() > 0
+    monkeypatch.setattr(LostChains, "found", lambda self, m: np.zeros(len(m["log"]), dtype=bool))
+    with pytest.warns(ConvergenceWarning):
+        assert answer(depth=60.0, width=1.0).min() < 0
+
+
+def test_modes_that_weigh_something_keep_their_chains() -> None:
+    with pytest.warns(ConvergenceWarning):
+        draws = answer(depth=0.0, width=3.0)
+    assert draws.min() < 0 < draws.max()
