@@ -25,7 +25,9 @@ _NOTHING, _EACH = 20.0, 1.0
 #: draws of a chain below which its spread is not known
 _FEW = 40
 #: share of all chains, and how many of them at least, that have to be in the modes that count
-_SHARE, _FOUND = 0.125, 2
+_SHARE, _FOUND = 1 / 32, 2
+#: standard deviations of both by which modes are apart
+_APART = 4.0
 #: of that log, how much a chain may rise within a window and count as one that stays
 _RISE = 0.25
 
@@ -41,9 +43,9 @@ class LostChains:
     >>> from bayesmc.kernels.lost_chains import LostChains
     >>> rng, lost = np.random.default_rng(0), LostChains()
     >>> memory = lost.start(chains=4, size=1)
-    >>> for _ in range(50):  # the last chain is 40 below the others, in a mode as wide
+    >>> for _ in range(50):  # the last chain is 40 below the others and 9 away
     ...     u = rng.standard_normal((4, 1))
-    ...     memory = lost.seen(memory, u, -0.5 * u[:, 0] ** 2 - [0, 0, 0, 40])
+    ...     memory = lost.seen(memory, u + [[0], [0], [0], [9]], -0.5 * u[:, 0] ** 2 - [0, 0, 0, 40])
     >>> lost.found(memory)
     array([False, False, False,  True])
     >>> lost.moved(lost.found(memory), rng)[:3]
@@ -72,8 +74,9 @@ class LostChains:
         """Which chains are lost: those that stay in modes that weigh nothing beside where others are.
 
         Both the height and the weight of a mode have to be far below: a spike that is high and thin outweighs
-        nobody, and one that is low and wide is not misjudged by its width. Nor is a chain lost that still
-        rises, nor one that only a few others left behind.
+        nobody, and one that is low and wide is not misjudged by its width. It has to be a mode of its own, in
+        some number apart from each of those that outweigh it: a chain that goes up and down a funnel is far
+        wider than where it mostly is, but no mode is apart from it. Nor is a chain lost that still rises.
         """
         chains, size = memory["mean"].shape
         nobody, count = np.zeros(chains, dtype=bool), memory["count"]
@@ -91,7 +94,12 @@ class LostChains:
         # of a line through the log densities, by least squares
         rise = 12 * count / (count**2 - 1) * (memory["timed"] - 0.5 * (count + 1) * height)
         below = (height < height[top].min() - margin) & (weight < weight[top].min() - margin)
-        return np.asarray(below & (rise < _RISE * margin))
+        found = below & (rise < _RISE * margin)
+        mean, variance = memory["mean"], memory["square"] / count
+        for other in top:
+            away = np.square(mean - mean[other]) / (variance + variance[other])
+            found &= away.max(axis=1) > _APART**2
+        return np.asarray(found)
 
     def moved(self, lost: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """For every chain the one from whose place it goes on: its own, or one of those not lost."""

@@ -11,6 +11,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.errors import ConvergenceWarning
+from bayesmc.kernels import lost_chains
 from bayesmc.kernels.lost_chains import LostChains
 from bayesmc.testing import session
 
@@ -18,9 +19,14 @@ SHIFT = session.seed()
 
 
 def window(
-    heights: list[float], widths: list[float], size: int = 5, count: int = 50, rise: float = 0.0
+    heights: list[float],
+    widths: list[float],
+    size: int = 5,
+    count: int = 50,
+    rise: float = 0.0,
+    apart: float = 20.0,
 ) -> np.ndarray:
-    """Which chains are lost, each in a Normal mode of its own; the last one rises by so much."""
+    """Which chains are lost, each in a Normal mode of its own where heights differ; the last one rises."""
     rng, lost = np.random.default_rng(7 + SHIFT), LostChains()
     chains = len(heights)
     memory = lost.start(chains, size)
@@ -28,7 +34,8 @@ def window(
         z = rng.standard_normal((chains, size))
         log = np.array(heights) - 0.5 * np.square(z).sum(axis=1)
         log[-1] += rise * (t / count - 1.0)
-        memory = lost.seen(memory, z * np.array(widths)[:, None], log)
+        places = apart * (np.array(heights) != heights[0])
+        memory = lost.seen(memory, z * np.array(widths)[:, None] + places[:, None], log)
     return lost.found(memory)
 
 
@@ -42,6 +49,7 @@ def test_most_chains_may_be_lost() -> None:
     found = window([0.0] * 2 + [-60.0] * 6, [1] * 8)
     assert found.tolist() == [False] * 2 + [True] * 6
     assert not window([0.0] + [-60.0] * 7, [1] * 8).any()  # one chain alone is no witness
+    assert window([0.0] * 2 + [-60.0] * 62, [1] * 64).sum() == 62
 
 
 def test_a_spike_outweighs_nobody_and_width_makes_up_for_height() -> None:
@@ -57,6 +65,31 @@ def test_chains_on_their_way_and_windows_of_few_draws_are_left() -> None:
     assert not window(heights, [1] * 4, rise=60.0)[-1]
     assert not window(heights, [1] * 4, count=39).any()
     assert not window([0.0, -60.0], [1, 1]).any()
+
+
+def test_what_is_not_apart_is_no_mode_of_its_own() -> None:
+    heights = [0.0, 0, 0, -60.0]
+    assert window(heights, [1] * 4, apart=8.0)[-1]
+    assert not window(heights, [1] * 4, apart=4.0).any()
+
+
+def down_a_funnel(size: int = 50) -> np.ndarray:
+    """Which of 32 chains are lost in one funnel: four that go far down it, others in its mouth."""
+    rng, lost = np.random.default_rng(11 + SHIFT), LostChains()
+    deep = np.arange(32) < 4
+    memory = lost.start(32, size + 1)
+    for _ in range(50):
+        log_scale = np.where(deep, rng.normal(-4.0, 2.0, 32), rng.normal(-1.6, 0.4, 32))
+        z = rng.standard_normal((32, size))
+        u = np.column_stack([log_scale, np.exp(log_scale)[:, None] * z])
+        memory = lost.seen(memory, u, -size * log_scale - 0.5 * np.square(z).sum(axis=1))
+    return lost.found(memory)
+
+
+def test_chains_in_the_mouth_of_a_funnel_are_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not down_a_funnel().any()
+    monkeypatch.setattr(lost_chains, "_APART", 0.0)  # by height and weight alone they were
+    assert down_a_funnel()[4:].any()
 
 
 @pytest.mark.parametrize("size", [1, 10, 200])
