@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines.mcmc.trajectories import _apart_from
 from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Bends
+from bayesmc.kernels.rescaled import Rescaled
 
 TREATED = np.array(
     [3, 7, 5, 102, 28, 4, 98, 60, 25, 138, 64, 45, 9, 57, 25, 33, 28, 8, 6, 32, 27, 22]
@@ -118,6 +120,19 @@ def test_the_advice_is_not_what_the_model_does_already() -> None:
     assert "apart from" not in advice[True]
     for words in advice.values():
         assert "give tighter priors, or raise target_accept=0.4 (0.95 or 0.99 or 0.999)" in words
+
+
+def test_of_several_scales_the_advice_names_that_of_the_trajectories_that_diverged() -> None:
+    kernels = []
+    for name, below in (("scale_a", ("a",)), ("scale_g", ("g",))):
+        kernel = Rescaled.__new__(Rescaled)
+        kernel.name, kernel.below = name, below
+        kernels.append(kernel)
+    nuts = Hamiltonian.__new__(Hamiltonian)
+    low = ", most of them where 'scale_g' is low (median 0.004, 0.17 elsewhere)"
+    assert "declare 'g' apart from the scale 'scale_g'" in _apart_from(nuts, kernels, low)
+    assert "'scale_g'" in _apart_from(nuts, kernels, low.replace("scale_g", "scale_g[1]"))
+    assert "declare 'a' apart from the scale 'scale_a'" in _apart_from(nuts, kernels)
 
 
 def test_the_advice_where_a_scale_is_not_found() -> None:

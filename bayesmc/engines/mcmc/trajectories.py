@@ -53,10 +53,11 @@ def faulty_trajectories(
         moves = memory["moves"] * len(memory["divergences"])
         diverged = int(memory["divergences"].sum())
         if diverged > _CHANCE * moves:
+            where = _where(posterior, kernel)
             yield (
-                f"{diverged} of {moves} trajectories diverged{_where(posterior, kernel)}: the density bends "
+                f"{diverged} of {moves} trajectories diverged{where}: the density bends "
                 "there more sharply than their steps can follow, and draws leave it out; "
-                f"{_apart_from(kernel, kernels)}give tighter priors, or {_shorter(posterior, memory)}"
+                f"{_apart_from(kernel, kernels, where)}give tighter priors, or {_shorter(posterior, memory)}"
             )
         cut = int(memory["saturated"].sum())
         if cut > _CUT * moves:
@@ -76,10 +77,14 @@ def faulty_trajectories(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _apart_from(kernel: Hamiltonian, kernels: list[Any]) -> str:
-    """Effects that are to be declared apart from their scale, in words; empty where all are."""
-    scaled = next((k for k in kernels if isinstance(k, Rescaled)), None)
-    if scaled is not None:
+def _apart_from(kernel: Hamiltonian, kernels: list[Any], where: str = "") -> str:
+    """Effects that are to be declared apart from their scale, in words; empty where all are.
+
+    Of several scales that which is named in ``where``, the words for where trajectories diverged.
+    """
+    rescaled = [k for k in kernels if isinstance(k, Rescaled)]
+    named = [k for k in rescaled if f"{k.name!r}" in where or f"'{k.name}[" in where]
+    for scaled in (named or rescaled)[:1]:
         return (
             f"declare {', '.join(map(repr, scaled.below))} apart from the scale {scaled.name!r} "
             "(z ~ Normal(0, 1), b = sigma * z), "
