@@ -313,13 +313,17 @@ class Hamiltonian(Kernel):
         memory["metric"] = self.metric.learnt(memory["metric"], place.u, place.slope)
         if pooled:
             memory = self._bent(memory)
-            memory["lost"] = self.lost.seen(memory["lost"], place.u, place.log)
+        if pooled and not self.given:
+            known = memory.get("lost") or self.lost.start(
+                *place.u.shape
+            )  # none of earlier versions
+            memory["lost"] = self.lost.seen(known, place.u, place.log)
         if sweep < self.ends[memory["windows"]]:
             return memory
         memory["windows"] += 1
-        lost = self.lost.found(memory["lost"])
+        lost = self.lost.found(memory["lost"]) if pooled and not self.given else np.zeros(0, bool)
         memory["lost"] = self.lost.start(*place.u.shape)
-        if lost.any() and not self.given:
+        if lost.any():
             place, memory = self._found_again(place, memory, lost, rng)
         else:
             memory["metric"] = self.metric.renewed(memory["metric"])

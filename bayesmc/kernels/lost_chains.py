@@ -2,9 +2,10 @@
 
 A chain that starts near a mode of its own may stay there for ever, however little that mode weighs, and every
 average over chains is then wrong by its share of them. What a mode weighs is its height times its width: of
-the draws of a window, the mean log density, and the entropy of a Normal density with their spread. That
-entropy is one of independent numbers, too large where numbers are correlated, by less than one for each in
-most posteriors; so modes are compared with a margin of one for each number, and ``exp(-20)`` for the answer.
+the draws of a window, the mean log density, and the entropy of a Normal density with their spread. Of a chain
+that may be lost that entropy is the one of independent numbers, which is too large; of one that outweighs it,
+that of the covariance of its draws, which is too small where they are few. A margin of one for each number is
+for what is no Normal density, and ``exp(-20)`` for the answer.
 
 References
 ----------
@@ -22,20 +23,25 @@ import numpy as np
 
 #: the log of what a mode weighs beside another that is left out, and more of it for each number
 _NOTHING, _EACH = 20.0, 1.0
-#: draws of a chain below which its spread is not known
-_FEW = 40
+#: draws of a chain below which its spread is not known: at least, and for each number; and numbers up to
+#: which chains keep their covariances
+_FEW, _FOR_EACH, _NUMBERS = 40, 2, 100
 #: share of all chains, and how many of them at least, that have to be in the modes that count
 _SHARE, _FOUND = 1 / 32, 2
 #: standard deviations of both by which modes are apart
 _APART = 4.0
 #: of that log, how much a chain may rise within a window and count as one that stays
 _RISE = 0.25
+#: share of a number's variance within a window that a line may explain: the spread of a chain that is on its
+#: way somewhere is not that of its mode
+_DRIFT = 0.5
 
 
 class LostChains:
-    """Of each chain in a window: mean and rise of the log density, and means and squares of its numbers.
+    """Of each chain in a window: the log density and its numbers, their products, and how they go with time.
 
-    A memory is a dict: ``count``, ``log`` and ``timed`` (chains,), ``mean`` and ``square`` (chains, size).
+    A memory is a dict: ``count``; of log density and numbers (chains, 1 + size) ``mean`` and ``timed``, the
+    means of them and of them times the count; ``products`` of numbers about their means (chains, size, size).
 
     Examples
     --------
@@ -54,20 +60,22 @@ class LostChains:
 
     def start(self, chains: int, size: int) -> dict[str, Any]:
         """The memory at the beginning of a window."""
-        row, rows = np.zeros(chains), np.zeros((chains, size))
-        return {"count": 0, "log": row, "timed": row, "mean": rows, "square": rows}
+        rows, kept = np.zeros((chains, 1 + size)), size if size <= _NUMBERS else 0
+        return {"count": 0, "mean": rows, "timed": rows, "products": np.zeros((chains, kept, kept))}
 
     def seen(self, memory: dict[str, Any], u: np.ndarray, log: np.ndarray) -> dict[str, Any]:
         """The memory with one more draw of every chain (Welford's update)."""
+        if not memory["products"].size:
+            return memory
         count = memory["count"] + 1
-        away = u - memory["mean"]
+        rows = np.column_stack([log, u])
+        away = rows - memory["mean"]
         mean = memory["mean"] + away / count
         return {
             "count": count,
-            "log": memory["log"] + (log - memory["log"]) / count,
-            "timed": memory["timed"] + (count * log - memory["timed"]) / count,
             "mean": mean,
-            "square": memory["square"] + away * (u - mean),
+            "timed": memory["timed"] + (count * rows - memory["timed"]) / count,
+            "products": memory["products"] + away[:, 1:, None] * (rows - mean)[:, None, 1:],
         }
 
     def found(self, memory: dict[str, Any]) -> np.ndarray:
@@ -76,26 +84,32 @@ class LostChains:
         Both the height and the weight of a mode have to be far below: a spike that is high and thin outweighs
         nobody, and one that is low and wide is not misjudged by its width. It has to be a mode of its own, in
         some number apart from each of those that outweigh it: a chain that goes up and down a funnel is far
-        wider than where it mostly is, but no mode is apart from it. Nor is a chain lost that still rises.
+        wider than where it mostly is, but no mode is apart from it. Nor is a chain lost that still rises, or
+        is on its way somewhere else.
         """
-        chains, size = memory["mean"].shape
-        nobody, count = np.zeros(chains, dtype=bool), memory["count"]
+        products, count = memory["products"], memory["count"]
+        chains, size, _ = products.shape
+        nobody = np.zeros(chains, dtype=bool)
         best = max(math.ceil(_SHARE * chains), _FOUND)
-        if count < _FEW or chains <= best:
+        if not size or count < max(_FEW, _FOR_EACH * size) or chains <= best:
             return nobody
+        height, mean = memory["mean"][:, 0], memory["mean"][:, 1:]
+        variance = np.diagonal(products, axis1=1, axis2=2) / count
+        # of lines through what is kept, by least squares: how far they rise within the window
+        rise = memory["timed"] - 0.5 * (count + 1) * memory["mean"]
+        rise *= 12 * count / (count**2 - 1)
         with np.errstate(divide="ignore", invalid="ignore"):
-            width = 0.5 * np.log(memory["square"] / count).sum(axis=1)
-        height = memory["log"]
-        weight = height + width
-        if not np.isfinite(weight).all():
+            most = height + 0.5 * np.log(variance).sum(axis=1)
+            sign, log_det = np.linalg.slogdet(products / count)
+            drift = np.square(rise[:, 1:]) / (12 * variance)
+        least = np.where(sign > 0, height + 0.5 * log_det, -np.inf)
+        top = np.argsort(-least, kind="stable")[:best]
+        if not (np.isfinite(height).all() and np.isfinite(least[top]).all()):
             return nobody
-        top = np.argsort(-weight, kind="stable")[:best]
         margin = _NOTHING + _EACH * size
-        # of a line through the log densities, by least squares
-        rise = 12 * count / (count**2 - 1) * (memory["timed"] - 0.5 * (count + 1) * height)
-        below = (height < height[top].min() - margin) & (weight < weight[top].min() - margin)
-        found = below & (rise < _RISE * margin)
-        mean, variance = memory["mean"], memory["square"] / count
+        found = (height < height[top].min() - margin) & (most < least[top].min() - margin)
+        # a chain that stands still has no drift
+        found &= (rise[:, 0] < _RISE * margin) & ~(drift > _DRIFT).any(axis=1)
         for other in top:
             away = np.square(mean - mean[other]) / (variance + variance[other])
             found &= away.max(axis=1) > _APART**2

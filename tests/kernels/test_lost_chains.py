@@ -67,6 +67,59 @@ def test_chains_on_their_way_and_windows_of_few_draws_are_left() -> None:
     assert not window([0.0, -60.0], [1, 1]).any()
 
 
+def smooth_and_rough(size: int = 40) -> np.ndarray:
+    """Which chains are lost in two modes of equal weight: a smooth random walk's, and one of noise."""
+    rng, lost = np.random.default_rng(5 + SHIFT), LostChains()
+    steps = np.r_[0.4, np.full(size - 1, 0.02)]
+    memory = lost.start(8, size)
+    for _ in range(160):
+        z = rng.standard_normal((8, size))
+        log = -0.5 * np.square(z).sum(axis=1)
+        smooth = np.arange(8) < 4
+        u = np.where(smooth[:, None], np.cumsum(steps * z, axis=1), 5.0 + 0.3 * z)
+        log -= np.where(smooth, np.log(steps).sum(), size * np.log(0.3))
+        memory = lost.seen(memory, u, log)
+    return lost.found(memory)
+
+
+def test_a_narrow_mode_of_correlated_numbers_is_no_wider_than_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert not smooth_and_rough().any()
+    spread = np.linalg.slogdet
+    independent = lambda a: spread(a * np.eye(a.shape[-1]))  # noqa: E731
+    monkeypatch.setattr(np.linalg, "slogdet", independent)
+    assert smooth_and_rough()[4:].all()  # half of the posterior would be left out
+
+
+def test_a_chain_that_stands_still_is_found_and_hides_no_other() -> None:
+    rng, lost = np.random.default_rng(2 + SHIFT), LostChains()
+    memory = lost.start(6, 3)
+    low = np.array([0, 0, 0, 0, 100.0, 100.0])
+    for _ in range(50):
+        z = rng.standard_normal((6, 3)) * np.array([1, 1, 1, 1, 1, 0])[:, None]
+        memory = lost.seen(memory, z + (20.0 * (low > 0))[:, None], -low)
+    assert lost.found(memory).tolist() == [False] * 4 + [True] * 2
+
+
+def test_a_chain_that_walks_slowly_is_not_judged() -> None:
+    rng, lost = np.random.default_rng(3 + SHIFT), LostChains()
+    memory, walk = lost.start(4, 20), np.zeros(20)
+    for _ in range(60):
+        z = rng.standard_normal((4, 20))
+        walk = walk + 0.01 * z[3]
+        z[3] = 30.0 + walk
+        memory = lost.seen(memory, z, np.array([0, 0, 0, -60.0]))
+    assert not lost.found(memory).any()
+
+
+def test_few_draws_for_many_numbers_tell_nothing() -> None:
+    heights = [0.0, 0, 0, -200.0]
+    assert window(heights, [1] * 4, size=40, count=80)[-1]
+    assert not window(heights, [1] * 4, size=40, count=79).any()
+    assert not window([0.0, 0, 0, -9e9], [1] * 4, size=101, count=300).any()
+
+
 def test_what_is_not_apart_is_no_mode_of_its_own() -> None:
     heights = [0.0, 0, 0, -60.0]
     assert window(heights, [1] * 4, apart=8.0)[-1]
@@ -78,7 +131,7 @@ def down_a_funnel(size: int = 50) -> np.ndarray:
     rng, lost = np.random.default_rng(11 + SHIFT), LostChains()
     deep = np.arange(32) < 4
     memory = lost.start(32, size + 1)
-    for _ in range(50):
+    for _ in range(200):
         log_scale = np.where(deep, rng.normal(-4.0, 2.0, 32), rng.normal(-1.6, 0.4, 32))
         z = rng.standard_normal((32, size))
         u = np.column_stack([log_scale, np.exp(log_scale)[:, None] * z])
@@ -129,7 +182,7 @@ def test_an_answer_is_of_the_mode_that_counts(monkeypatch: pytest.MonkeyPatch) -
     mean = 30.0 * 900 / 901  # of the mode beside the prior
     error = 1.0 / np.sqrt(draws.size / 10)  # far fewer independent ones than there are
     assert abs(draws.mean() - mean) < 4.9 * error and draws.min() > 0
-    monkeypatch.setattr(LostChains, "found", lambda self, m: np.zeros(len(m["log"]), dtype=bool))
+    monkeypatch.setattr(LostChains, "found", lambda self, m: np.zeros(len(m["mean"]), dtype=bool))
     with pytest.warns(ConvergenceWarning):
         assert answer(depth=60.0, width=1.0).min() < 0
 
