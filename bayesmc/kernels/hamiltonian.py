@@ -133,7 +133,8 @@ class Hamiltonian(Kernel):
         #: a warmup whose length is said learns for the acceptance that is said
         self.bends = Bends() if warmup is None else None
         self.metric = MetricLearning(fitting(metric, density.size))
-        self.lost = LostChains()
+        #: what moves otherwise, too, is another density in each chain: none compares with the others
+        self.lost = LostChains(0) if given else LostChains()
         self.ends, self.beginning = windows(warmup)
 
     def expect(self, steps: int, chains: int) -> None:
@@ -313,15 +314,11 @@ class Hamiltonian(Kernel):
         memory["metric"] = self.metric.learnt(memory["metric"], place.u, place.slope)
         if pooled:
             memory = self._bent(memory)
-        if pooled and not self.given:
-            known = memory.get("lost") or self.lost.start(
-                *place.u.shape
-            )  # none of earlier versions
-            memory["lost"] = self.lost.seen(known, place.u, place.log)
+            memory["lost"] = self.lost.seen(memory["lost"], place.u, place.log)
         if sweep < self.ends[memory["windows"]]:
             return memory
         memory["windows"] += 1
-        lost = self.lost.found(memory["lost"]) if pooled and not self.given else np.zeros(0, bool)
+        lost = self.lost.found(memory["lost"])
         memory["lost"] = self.lost.start(*place.u.shape)
         if lost.any():
             place, memory = self._found_again(place, memory, lost, rng)

@@ -43,6 +43,11 @@ class LostChains:
     A memory is a dict: ``count``; of log density and numbers (chains, 1 + size) ``mean`` and ``timed``, the
     means of them and of them times the count; ``products`` of numbers about their means (chains, size, size).
 
+    Parameters
+    ----------
+    numbers : int
+        How many there may be at most; with more, and of 0, nobody is lost.
+
     Examples
     --------
     >>> import numpy as np
@@ -58,9 +63,12 @@ class LostChains:
     array([0, 1, 2])
     """
 
+    def __init__(self, numbers: int = _NUMBERS) -> None:
+        self.numbers = numbers
+
     def start(self, chains: int, size: int) -> dict[str, Any]:
         """The memory at the beginning of a window."""
-        rows, kept = np.zeros((chains, 1 + size)), size if size <= _NUMBERS else 0
+        rows, kept = np.zeros((chains, 1 + size)), size if size <= self.numbers else 0
         return {"count": 0, "mean": rows, "timed": rows, "products": np.zeros((chains, kept, kept))}
 
     def seen(self, memory: dict[str, Any], u: np.ndarray, log: np.ndarray) -> dict[str, Any]:

@@ -129,9 +129,9 @@ def test_of_several_scales_the_advice_names_that_of_the_trajectories_that_diverg
         kernel.name, kernel.below = name, below
         kernels.append(kernel)
     nuts = Hamiltonian.__new__(Hamiltonian)
-    low = ", most of them where 'scale_g' is low (median 0.004, 0.17 elsewhere)"
-    assert "declare 'g' apart from the scale 'scale_g'" in _apart_from(nuts, kernels, low)
-    assert "'scale_g'" in _apart_from(nuts, kernels, low.replace("scale_g", "scale_g[1]"))
+    assert "declare 'g' apart from the scale 'scale_g'" in _apart_from(
+        nuts, kernels, ["scale_g", "g"]
+    )
     assert "declare 'a' apart from the scale 'scale_a'" in _apart_from(nuts, kernels)
 
 

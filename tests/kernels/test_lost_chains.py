@@ -191,3 +191,9 @@ def test_modes_that_weigh_something_keep_their_chains() -> None:
     with pytest.warns(ConvergenceWarning):
         draws = answer(depth=0.0, width=3.0)
     assert draws.min() < 0 < draws.max()
+
+
+def test_densities_that_differ_from_chain_to_chain_are_not_compared() -> None:
+    lost = LostChains(numbers=0)
+    memory = lost.seen(lost.start(4, 2), np.zeros((4, 2)), np.zeros(4))
+    assert not lost.found(memory).any() and memory["count"] == 0

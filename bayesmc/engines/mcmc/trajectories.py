@@ -13,7 +13,7 @@ Betancourt (2016), Diagnosing suboptimal cotangent disintegrations in Hamiltonia
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -53,11 +53,11 @@ def faulty_trajectories(
         moves = memory["moves"] * len(memory["divergences"])
         diverged = int(memory["divergences"].sum())
         if diverged > _CHANCE * moves:
-            where = _where(posterior, kernel)
+            names, where = _where(posterior, kernel)
             yield (
                 f"{diverged} of {moves} trajectories diverged{where}: the density bends "
                 "there more sharply than their steps can follow, and draws leave it out; "
-                f"{_apart_from(kernel, kernels, where)}give tighter priors, or {_shorter(posterior, memory)}"
+                f"{_apart_from(kernel, kernels, names)}give tighter priors, or {_shorter(posterior, memory)}"
             )
         cut = int(memory["saturated"].sum())
         if cut > _CUT * moves:
@@ -77,14 +77,15 @@ def faulty_trajectories(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _apart_from(kernel: Hamiltonian, kernels: list[Any], where: str = "") -> str:
+def _apart_from(kernel: Hamiltonian, kernels: list[Any], names: Sequence[str] = ()) -> str:
     """Effects that are to be declared apart from their scale, in words; empty where all are.
 
-    Of several scales that which is named in ``where``, the words for where trajectories diverged.
+    Of several scales the first among ``names``, the nodes that tell where trajectories diverged.
     """
     rescaled = [k for k in kernels if isinstance(k, Rescaled)]
-    named = [k for k in rescaled if f"{k.name!r}" in where or f"'{k.name}[" in where]
-    for scaled in (named or rescaled)[:1]:
+    named = [k for k in rescaled if k.name in names]
+    if rescaled:
+        scaled = (named or rescaled)[0]
         return (
             f"declare {', '.join(map(repr, scaled.below))} apart from the scale {scaled.name!r} "
             "(z ~ Normal(0, 1), b = sigma * z), "
@@ -130,14 +131,14 @@ def _shorter(posterior: ChainsPosterior | ChainsSums, memory: Mapping[str, Any])
     return f"raise target_accept={known:g} ({higher})" if higher else "another engine"
 
 
-def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> str:
-    """The numbers that tell most where trajectories diverged, in words; empty where none does."""
+def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> tuple[list[str], str]:
+    """The nodes whose numbers tell most where trajectories diverged, and words; empty where none does."""
     diverged = posterior.divergences
     if not isinstance(posterior, ChainsPosterior) or diverged is None:
-        return ""
+        return [], ""
     if not diverged.any() or diverged.all():
-        return ""
-    found: list[tuple[float, str]] = []
+        return [], ""
+    found: list[tuple[float, str, str]] = []
     left = _NUMBERS
     for name in kernel.density.names:
         stored = posterior._stored.get(name)
@@ -150,11 +151,12 @@ def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> str:
             score, words = _apart(columns[..., k], diverged)
             index = np.unravel_index(k, shape) if shape else ()
             label = scalar_name(posterior.model, name, tuple(int(i) for i in index))
-            found.append((score, f"{label!r} is {words}"))
-    found = sorted((f for f in found if f[0] > _LIMIT), key=lambda f: -f[0])
+            found.append((score, name, f"{label!r} is {words}"))
+    found = sorted((f for f in found if f[0] > _LIMIT), key=lambda f: -f[0])[:2]
     if not found:
-        return ""
-    return ", most of them where " + " and ".join(words for _, words in found[:2])
+        return [], ""
+    words = " and ".join(words for _, _, words in found)
+    return [name for _, name, _ in found], f", most of them where {words}"
 
 
 def _apart(values: np.ndarray, diverged: np.ndarray) -> tuple[float, str]:
