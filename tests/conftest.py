@@ -1,7 +1,8 @@
 """What every test file shares: the reference data, and a Hypothesis profile without chance, or with.
 
-An ordinary run is the same every time. A thorough one (``--bayesmc-thorough``) lets Hypothesis draw other
-and more examples, by the seed of the run, so that ``--bayesmc-seed`` repeats them as well.
+An ordinary run is the same every time: what draws without a seed is seeded by the test's name. A thorough
+one (``--bayesmc-thorough``) lets Hypothesis draw other and more examples, by the seed of the run, so that
+``--bayesmc-seed`` repeats them as well.
 
 Tests that hold bayesmc against published numbers take the fixture ``reference_data`` (a path),
 which marks them ``reference``; where the data is absent they are skipped, and the run's last lines
@@ -13,11 +14,13 @@ Tests marked ``thorough`` take long and are much like others; an ordinary run le
 from __future__ import annotations
 
 import os
+import random
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
+import numpy as np
 import pytest
 
 from bayesmc.testing import session
@@ -40,6 +43,16 @@ def pytest_configure(config: pytest.Config) -> None:
     # Hypothesis reads the option after this
     if session.is_thorough() and getattr(config.option, "hypothesis_seed", "") is None:
         config.option.hypothesis_seed = str(session.seed())
+
+
+@pytest.fixture(autouse=True)
+def seeded_by_name(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``rng=None`` draws other numbers at every call, and the same ones in every run of the suite.
+
+    A statistical test whose author forgot the seed would fail on some day, at its false-alarm rate.
+    """
+    fresh = random.Random(f"{session.seed()} {request.node.nodeid}")
+    monkeypatch.setattr(np.random.bit_generator, "randbits", fresh.getrandbits)
 
 
 @pytest.fixture(autouse=True)

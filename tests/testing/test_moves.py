@@ -480,7 +480,7 @@ def test_kernels_of_models_that_are_no_nets(test: Any, kernel: Any, words: str) 
 def test_kernels_that_can_be_called_with_three_arguments(kernel: Any) -> None:
     statistics = {"x": lambda x, y: x, "whole": lambda x, y: np.array([*map(int, x)], dtype=object)}
     model = JointModel(lambda rng, n: rng.normal(size=n), lambda x, rng: None, statistics)
-    assert rank_test(kernel, model, replications=20)
+    assert rank_test(kernel, model, replications=20, rng=0)
 
 
 @pytest.mark.parametrize("observed", [np.array(["y"]), {"y": 1.0}, {"y"}, ("y",), iter(["y"])])
