@@ -17,5 +17,5 @@ def test_what_has_no_seed_is_seeded_by_the_tests_name(request: pytest.FixtureReq
     assert drawn == [named.getrandbits(128) for _ in range(3)]
     net = bmc.BayesNet()
     net.add("x", bmc.Normal(0.0, 1.0))
-    first, second = (bmc.sample(net, 10)["x"] for _ in range(2))
+    first, second = (net.sample(10)["x"] for _ in range(2))
     assert not np.array_equal(first, second)
