@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression, ordered
+from bayesmc.expression import Expression, Program, ordered
 from bayesmc.lowering.compiled import Compiled, compiled
 from bayesmc.lowering.layout import written_out
 
@@ -19,6 +20,8 @@ _WORTH = 0.1
 _ONE, _PAIR = 2e-4, 5e-8
 #: how far results may be off, relative to the largest element of each
 _RTOL = 1e-9
+#: and relative to what one rounding of each matrix does to them
+_ROUNDINGS = 1e3
 
 
 def is_worth_it(roots: Sequence[Expression], calls: int, entries: int = 1, beside: int = 0) -> bool:
@@ -46,6 +49,7 @@ def held_against_numpy(
     roots: Sequence[Expression],
     points: Iterable[Mapping[str, np.ndarray]],
     debug: bool = False,
+    disturbed: Sequence[Expression] = (),
 ) -> Compiled | Compared:
     """Machine code that gives what ``Program`` does at some points.
 
@@ -56,13 +60,15 @@ def held_against_numpy(
         Values of the leaves, with any batch.
     debug : bool
         Compare at every later call, too.
+    disturbed : sequence of Expression, optional
+        The same roots as rounding may change them (``passes.rounding``): how near they have to be.
 
     Raises
     ------
     TraceError
         There is no machine code, or it gives something else: which, and why.
     """
-    made = Compared(compiled(roots))
+    made = Compared(compiled(roots), disturbed)
     for values in points:
         made(values)
     return made if debug else made.run
@@ -74,10 +80,11 @@ class Compared:
     Parameters
     ----------
     run : Compiled
+    disturbed : sequence of Expression, optional
     """
 
-    def __init__(self, run: Compiled) -> None:
-        self.run = run
+    def __init__(self, run: Compiled, disturbed: Sequence[Expression] = ()) -> None:
+        self.run, self.disturbed = run, disturbed
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         """What both give.
@@ -89,15 +96,31 @@ class Compared:
         found, wanted = self.run(values), self.run.program(values)
         for root, a, b in zip(self.run.roots, found, wanted, strict=True):
             off = _difference(a, np.asarray(b))
+            if off is not None and self.disturbed:
+                off = _difference(a, np.asarray(b), self._doubts(values)[root])
             if off is not None:
                 raise TraceError(f"machine code of {root!r} {off}")
+        return found
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _doubts(self, values: Mapping[str, np.ndarray]) -> dict[Expression, np.ndarray]:
+        """How far rounding takes each root, the most of any element; no number where it decides on that."""
+        found, roots = {}, self.run.roots
+        others = Program(self.disturbed)(values)
+        for root, a, b in zip(roots, self.run.program(values), others, strict=True):
+            event = tuple(range(-len(root.shape), 0))
+            is_same = (a == b) | (np.isnan(a) & np.isnan(b))
+            with np.errstate(invalid="ignore"):
+                off = np.where(is_same, 0.0, np.abs(np.subtract(a, b, dtype=float)))
+            found[root] = off.max(axis=event, keepdims=True)
         return found
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _difference(found: np.ndarray, wanted: np.ndarray) -> str | None:
+def _difference(found: np.ndarray, wanted: np.ndarray, doubt: Any = 0.0) -> str | None:
     if found.shape != wanted.shape:
         return f"has the shape {found.shape}, not {wanted.shape}"
     if wanted.dtype.kind != "f":
@@ -106,8 +129,9 @@ def _difference(found: np.ndarray, wanted: np.ndarray) -> str | None:
         finite = np.isfinite(wanted)
         scale = 1.0 + np.abs(wanted[finite]).max(initial=0.0)
         with np.errstate(all="ignore"):
-            near = np.abs(found - wanted) <= _RTOL * scale
+            near = np.abs(found - wanted) <= _RTOL * scale + _ROUNDINGS * doubt
         same = np.where(finite, near, (found == wanted) | (np.isnan(found) & np.isnan(wanted)))
+        same = same | np.isnan(doubt)
     if same.all():
         return None
     at = int(np.argmin(same))

@@ -196,6 +196,12 @@ class Code:
             self.set(name, start)
         return name
 
+    def memory(self, count: int, kind: str = REAL) -> str:
+        """Where so many numbers have a place while the function runs."""
+        self._count += 1
+        self._entry.append(f"  %m{self._count} = alloca {STORED[kind]}, i64 {count}")
+        return f"%m{self._count}"
+
     def get(self, place: str, kind: str) -> Number:
         return self.op(kind, f"load {kind}, ptr {place}")
 
@@ -250,6 +256,21 @@ class Code:
         self._lines[at] = f"  {i.text} = phi i64 [ 0, %{before} ], [ {following}, %{self._block} ]"
         self._lines.append(f"{end}:")
         self._block = end
+
+    def span(self, low: Number, high: Number, body: Callable[[Number], None]) -> None:
+        """``body(i)`` for i from ``low`` to below ``high``, if any."""
+        self.when(low < high, lambda: self.loop(high - low, lambda i: body(low + i)))
+
+    def total(self, low: Number, high: Number, term: Callable[[Number], Number]) -> Number:
+        """The sum of real terms over such a span, in the machine's order."""
+        found = self.variable(self.number(0.0))
+
+        def add(i: Number) -> None:
+            old = self.get(found, REAL).text
+            self.set(found, self.op(REAL, f"fadd reassoc double {old}, {term(i).text}"))
+
+        self.span(low, high, add)
+        return self.get(found, REAL)
 
     def when(self, condition: Number, body: Callable[[], None]) -> None:
         """``body()`` where a condition holds."""

@@ -138,21 +138,6 @@ def _loaded() -> Loaded:
     return loaded("\n".join([str(module), *texts]), module.foreign)
 
 
-def _span(c: Code, low: Number, high: Number, body: Callable[[Number], None]) -> None:
-    """``body(i)`` for i from ``low`` to below ``high``, if any."""
-    c.when(low < high, lambda: c.loop(high - low, lambda i: body(low + i)))
-
-
-def _sum(c: Code, low: Number, high: Number, term: Callable[[Number], Number]) -> Number:
-    total = c.variable(c.number(0.0))
-
-    def add(i: Number) -> None:
-        c.set(total, c.op(REAL, f"fadd reassoc double {c.get(total, REAL).text}, {term(i).text}"))
-
-    _span(c, low, high, add)
-    return c.get(total, REAL)
-
-
 def _abs(c: Code, x: Number) -> Number:
     return c.call("llvm.fabs.f64", x)
 
@@ -165,7 +150,7 @@ def _triangular(c: Code, r: Number, k: Number, suspect: str) -> None:
 
     def reflect(a: Number) -> None:
         own = a * k
-        norm = c.call("llvm.sqrt.f64", _sum(c, a, k, lambda j: _square(c, own + j)))
+        norm = c.call("llvm.sqrt.f64", c.total(a, k, lambda j: _square(c, own + j)))
         first = c.load("%work", own + a, REAL)
         sign = c.where(first < 0.0, c.number(1.0), c.number(-1.0))
         pivot = sign * norm  # of the sign that first has not
@@ -175,8 +160,7 @@ def _triangular(c: Code, r: Number, k: Number, suspect: str) -> None:
         def others(b: Number) -> None:
             at = b * k
             share = (
-                _sum(
-                    c,
+                c.total(
                     a,
                     k,
                     lambda j: c.load("%work", at + j, REAL) * c.load("%work", own + j, REAL),
@@ -188,17 +172,17 @@ def _triangular(c: Code, r: Number, k: Number, suspect: str) -> None:
                 found = c.load("%work", at + j, REAL) - share * c.load("%work", own + j, REAL)
                 c.store("%work", at + j, found)
 
-            _span(c, a, k, move)
+            c.span(a, k, move)
             entry = c.load("%work", at + a, REAL) * sign
             c.store("%work", at + a, entry)
             c.set(largest, c.call("llvm.maximum.f64", c.get(largest, REAL), _abs(c, entry)))
 
-        _span(c, a + 1, r, others)
+        c.span(a + 1, r, others)
         c.store("%work", own + a, norm)
         c.set(largest, c.call("llvm.maximum.f64", c.get(largest, REAL), norm))
         c.set(least, c.call("llvm.minimum.f64", c.get(least, REAL), norm))
 
-    _span(c, zero, r, reflect)
+    c.span(zero, r, reflect)
     fine = c.get(least, REAL) > _SUSPECT * c.get(largest, REAL)
     bad = c.where(fine, c.number(0, WHOLE), c.number(1, WHOLE))
     c.set(suspect, c.get(suspect, WHOLE) | bad)
@@ -225,16 +209,16 @@ def _expect(c: Code, i: Number, r: Number, m: Number, before: Number, fresh: Num
             return c.load("%moves", moves + x, REAL) * c.load("%factor", root + (x * m + j), REAL)
 
         def move(j: Number) -> None:
-            c.store("%work", at + j, _sum(c, zero, before, lambda x: of_factor(j, x)))
+            c.store("%work", at + j, c.total(zero, before, lambda x: of_factor(j, x)))
 
         def add(j: Number) -> None:
             c.store("%work", at + (before + j), c.load("%noise", noise + j, REAL))
 
-        c.store("%expected", a, _sum(c, zero, before, of_mean) + c.load("%offset", line, REAL))
-        _span(c, zero, before, move)
-        _span(c, zero, fresh, add)
+        c.store("%expected", a, c.total(zero, before, of_mean) + c.load("%offset", line, REAL))
+        c.span(zero, before, move)
+        c.span(zero, fresh, add)
 
-    _span(c, zero, r, expect)
+    c.span(zero, r, expect)
 
 
 def _conditioned(module: Module) -> str:
@@ -254,7 +238,7 @@ def _conditioned(module: Module) -> str:
 
         def solve(a: Number) -> None:
             """Standardised innovations, which stand behind what was expected."""
-            known = _sum(c, zero, a, lambda b: of_eta(a * k, b))
+            known = c.total(zero, a, lambda b: of_eta(a * k, b))
             pivot = c.load("%work", a * k + a, REAL)
             eta = (c.load("%row", a, REAL) - c.load("%expected", a, REAL) - known) / pivot
             c.store("%expected", r + a, eta)
@@ -263,13 +247,13 @@ def _conditioned(module: Module) -> str:
 
         def rest(a: Number) -> None:
             line = (p + a) * k
-            gained = _sum(c, zero, p, lambda b: of_eta(line, b))
+            gained = c.total(zero, p, lambda b: of_eta(line, b))
             c.store("%after", i * n + a, c.load("%expected", p + a, REAL) + gained)
             _lower(c, a, n, i * (n * n), lambda b: c.load("%work", line + (p + b), REAL))
 
-        _span(c, zero, p, solve)
+        c.span(zero, p, solve)
         c.store("%log", i, c.get(total, REAL))
-        _span(c, zero, n, rest)
+        c.span(zero, n, rest)
 
     c.loop(size, one)
     c.do(f"ret i64 {c.get(suspect, WHOLE).text}")
@@ -290,7 +274,7 @@ def _lower(c: Code, a: Number, n: Number, start: Number, entry: Callable[[Number
         c.store("%root", start + (a * n + b), c.number(0.0))
         c.when(b <= a, lambda: c.store("%root", start + (a * n + b), entry(b)))
 
-    _span(c, c.number(0, WHOLE), n, put)
+    c.span(c.number(0, WHOLE), n, put)
 
 
 def _merged(module: Module) -> str:
@@ -302,27 +286,27 @@ def _merged(module: Module) -> str:
     def one(i: Number) -> None:
         first = i * size
         top = c.variable(c.number(-math.inf))
-        _span(c, zero, size, lambda g: c.set(
+        c.span(zero, size, lambda g: c.set(
             top, c.call("llvm.maximum.f64", c.get(top, REAL), c.load("%log", first + g, REAL))
         ))  # fmt: skip
         level = c.get(top, REAL)
-        weight = _sum(
-            c, zero, size, lambda g: elementary(c, "exp", c.load("%log", first + g, REAL) - level)
+        weight = c.total(
+            zero, size, lambda g: elementary(c, "exp", c.load("%log", first + g, REAL) - level)
         )
         c.store("%total", i, elementary(c, "log", weight) + level)
-        _span(c, zero, n, lambda a: c.store("%centre", i * n + a, c.number(0.0)))
+        c.span(zero, n, lambda a: c.store("%centre", i * n + a, c.number(0.0)))
 
         def share(g: Number) -> Number:
             return elementary(c, "exp", c.load("%log", first + g, REAL) - level) / weight
 
         def gather(g: Number) -> None:
             part = share(g)
-            _span(c, zero, n, lambda a: c.store(
+            c.span(zero, n, lambda a: c.store(
                 "%centre", i * n + a,
                 c.load("%centre", i * n + a, REAL) + part * c.load("%mean", (first + g) * n + a, REAL),
             ))  # fmt: skip
 
-        _span(c, zero, size, gather)
+        c.span(zero, size, gather)
 
         def beside(g: Number) -> None:
             scale, at = c.call("llvm.sqrt.f64", share(g)), g * (width + 1)
@@ -330,17 +314,17 @@ def _merged(module: Module) -> str:
 
             def line(a: Number) -> None:
                 own, place = (member * n + a) * width, a * k + at
-                _span(c, zero, width, lambda j: c.store(
+                c.span(zero, width, lambda j: c.store(
                     "%work", place + j, scale * c.load("%factor", own + j, REAL)
                 ))  # fmt: skip
                 off = c.load("%mean", member * n + a, REAL) - c.load("%centre", i * n + a, REAL)
                 c.store("%work", place + width, scale * off)
 
-            _span(c, zero, n, line)
+            c.span(zero, n, line)
 
-        _span(c, zero, size, beside)
+        c.span(zero, size, beside)
         _triangular(c, n, k, suspect)
-        _span(c, zero, n, lambda a: _lower(
+        c.span(zero, n, lambda a: _lower(
             c, a, n, i * (n * n), lambda b: c.load("%work", a * k + b, REAL)
         ))  # fmt: skip
 

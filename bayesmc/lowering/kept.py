@@ -10,7 +10,14 @@ import numpy as np
 from bayesmc.expression import Call, Expression, Pick, Reduction
 from bayesmc.expression.scatter import Gathered, Scattered
 from bayesmc.lowering.code import REAL
-from bayesmc.lowering.layout import FEW, adds_in_place, cumulated_axis, is_given
+from bayesmc.lowering.layout import (
+    FEW,
+    adds_in_place,
+    cumulated_axis,
+    is_given,
+    matrix_function,
+)
+from bayesmc.lowering.matrices import keep_matrices
 from bayesmc.lowering.places import flat, plus, times, unraveled
 from bayesmc.lowering.schedule import is_sum, loop_shape
 from bayesmc.lowering.ufuncs import kind_of
@@ -23,6 +30,8 @@ def keep(w: Writer, node: Expression) -> None:
     if isinstance(node, Call):
         if isinstance(node.call, (Scattered, Gathered)):
             _add_up(w, node)
+        elif matrix_function(node) is not None:
+            keep_matrices(w, node)
         else:
             _cumulate(w, node, pointer)
     elif isinstance(node, Pick) and len(node.operands) > 1:

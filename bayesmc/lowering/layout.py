@@ -35,6 +35,11 @@ FEW = 8
 #: elements written out, and bytes kept for one entry, beyond which nothing is compiled
 _WRITTEN, _KEPT = 20_000, 1 << 26
 
+#: rows and columns of matrices beyond which LAPACK's blocks are faster than loops
+ROWS_MOST = 48
+
+_MATRIX_FUNCTIONS = frozenset((np.linalg.cholesky, np.linalg.inv, np.linalg.det, np.linalg.solve))
+
 #: ufuncs that reduce -> what they begin with
 STARTS: dict[Any, float] = {
     np.add: 0.0, np.multiply: 1.0, np.maximum: -math.inf, np.minimum: math.inf,
@@ -144,6 +149,19 @@ def cumulated_axis(node: Call) -> int | None:
     return len(node.shape) + axis if is_plain and isinstance(axis, int) and axis < 0 else None
 
 
+def matrix_function(node: Expression) -> Any | None:
+    """NumPy's function of matrices that a call is, guarded or not; None where it is none with code."""
+    made = node.call if isinstance(node, Call) else None
+    if not isinstance(made, Repeated) or made.kwargs or made.output is not None:
+        return None
+    function = getattr(made.function, "function", made.function)
+    if function not in _MATRIX_FUNCTIONS or node.dtype.kind != "f":
+        return None
+    operands = node.operands
+    is_plain = made.slots == list(range(len(operands))) and all(len(a.shape) > 1 for a in operands)
+    return function if is_plain else None
+
+
 def strides_of(positions: np.ndarray) -> tuple[int, Shape] | None:
     """``(first, steps along each axis)`` of positions that are evenly spaced; else None."""
     if not positions.size:
@@ -170,9 +188,16 @@ def _check(node: Expression) -> None:
         raise TraceError(f"{node.detail} of numbers of type {node.dtype} has no machine code")
     if isinstance(node, Reduction) and node.ufunc not in STARTS:
         raise TraceError(f"{node.ufunc.__name__}.reduce has no machine code")
-    is_sum = isinstance(node, Call) and isinstance(node.call, (Scattered, Gathered))
-    if isinstance(node, Call) and not is_sum and cumulated_axis(node) is None:
+    if isinstance(node, Call) and not _is_call_with_code(node):
         raise TraceError(f"{node.detail} has no machine code")
+    rows = node.operands[0].shape[-1] if matrix_function(node) is not None else 0
+    if rows > ROWS_MOST:
+        raise TraceError(f"{node.detail} of {rows} rows has no machine code ({ROWS_MOST} at most)")
+
+
+def _is_call_with_code(node: Call) -> bool:
+    is_sum = isinstance(node.call, (Scattered, Gathered))
+    return is_sum or cumulated_axis(node) is not None or matrix_function(node) is not None
 
 
 def _demand(node: Expression, layout: Layout) -> None:

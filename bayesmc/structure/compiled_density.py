@@ -21,6 +21,7 @@ from bayesmc.lowering import (
 )
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.guarded import guarded
+from bayesmc.passes.rounding import disturbed
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 
 #: how far the free numbers of the points where it is compared are from zero
@@ -144,7 +145,8 @@ class CompiledDensity(UnconstrainedDensity):
         if not is_worth_it(roots, self.calls, self.chains):
             return Program(for_arrays(roots)), f"NumPy: {self.calls} gradients take no time"
         try:
-            return held_against_numpy(roots, self._points(), self.debug), "machine code"
+            near = disturbed(roots)
+            return held_against_numpy(roots, self._points(), self.debug, near), "machine code"
         except TraceError as error:
             return Program(for_arrays(roots)), f"NumPy: {error}"
 

@@ -90,11 +90,11 @@ def test_explain_names_it() -> None:
 
     assert effort(schools(), EVIDENCE, warmup=2000).endswith("; trajectories in machine code")
     assert "gradients" not in effort(schools(), EVIDENCE, warmup=10)
-    net, factor = bmc.BayesNet(), np.array([[1.0, 0.0], [0.5, 1.0]])
+    net, factor = bmc.BayesNet(), np.eye(50) + 0.1 * np.eye(50, k=-1)
     net.add("s", bmc.Exponential(1.0))
-    net.add("y", lambda s: bmc.MvNormal(np.zeros(2), scale_tril=s[..., None, None] * factor))
-    assert effort(net, {"y": np.ones(2)}, warmup=9000).endswith(
-        "gradients in NumPy: inv has no machine code"
+    net.add("y", lambda s: bmc.MvNormal(np.zeros(50), scale_tril=s[..., None, None] * factor))
+    assert effort(net, {"y": np.ones(50)}, warmup=9000).endswith(
+        "gradients in NumPy: inv of 50 rows has no machine code (48 at most)"
     )
 
 

@@ -217,10 +217,10 @@ def test_log_density_hands_out_its_address() -> None:
     assert kind(fast.address)(5, *arrays, fast.arguments) == 0
     np.testing.assert_array_equal(value, fast(u)[0])
     with pytest.raises(UnsupportedError, match="no machine code"):
-        net, factor = bmc.BayesNet(), np.array([[1.0, 0.0], [0.5, 1.0]])
+        net, factor = bmc.BayesNet(), np.eye(50) + 0.1 * np.eye(50, k=-1)
         net.add("s", bmc.Exponential(1.0))
-        net.add("y", lambda s: bmc.MvNormal(np.zeros(2), scale_tril=s[..., None, None] * factor))
-        bmc.log_density(net, {"y": np.ones(2)}, compiled=True)
+        net.add("y", lambda s: bmc.MvNormal(np.zeros(50), scale_tril=s[..., None, None] * factor))
+        bmc.log_density(net, {"y": np.ones(50)}, compiled=True)
 
 
 def same_far_out(density: UnconstrainedDensity) -> bool:
