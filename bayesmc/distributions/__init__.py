@@ -23,6 +23,7 @@ from bayesmc.distributions.location_scale import Cauchy, HalfCauchy, HalfNormal,
 from bayesmc.distributions.mixture import Mixture
 from bayesmc.distributions.mvnormal import MvNormal
 from bayesmc.distributions.normal import Normal
+from bayesmc.distributions.ordered import Ordered, OrderedLogistic
 from bayesmc.distributions.positive import InverseGamma, LogNormal, Weibull
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.truncated import Truncated
@@ -56,6 +57,8 @@ __all__ = [
     "MvNormal",
     "NegativeBinomial",
     "Normal",
+    "Ordered",
+    "OrderedLogistic",
     "Poisson",
     "StudentT",
     "Support",

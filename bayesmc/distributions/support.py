@@ -15,7 +15,14 @@ import numpy as np
 from bayesmc.errors import ShapeError, UnsupportedError
 from bayesmc.gaussian import try_cholesky
 
-_EVENT_NDIM = {"simplex": 1, "real vector": 1, "positive definite": 2, "counts": 1, "product": 1}
+_EVENT_NDIM = {
+    "simplex": 1,
+    "real vector": 1,
+    "positive definite": 2,
+    "counts": 1,
+    "product": 1,
+    "increasing": 1,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,10 +33,10 @@ class Support:
     ----------
     kind : str
         ``"real"``, ``"interval"``, ``"circle"``, ``"integers"``, ``"simplex"``, ``"real vector"``,
-        ``"counts"``, ``"positive definite"`` or ``"product"``.
+        ``"counts"``, ``"positive definite"``, ``"increasing"`` or ``"product"``.
     low, high : float or array
-        Bounds of an interval or of integers (inclusive), possibly infinite; arrays when they
-        depend on parents.
+        Bounds of an interval, of integers (inclusive) or of numbers in order, possibly infinite; arrays when
+        they depend on parents.
     open_low, open_high : bool
         Whether the bound itself is excluded.
     parts : tuple of (Support, int)
@@ -141,6 +148,9 @@ class Support:
             return np.ones(x.shape[:-2], dtype=bool) if bad is None else ~bad
         if self.kind == "product":
             return self._parts_contain(x)
+        if self.kind == "increasing":
+            inside = ((x >= self.low) & (x <= self.high) & np.isfinite(x)).all(axis=-1)
+            return inside & (x[..., 1:] >= x[..., :-1]).all(axis=-1)
         above = x > self.low if self.open_low else x >= self.low
         below = x < self.high if self.open_high else x <= self.high
         inside = above & below & np.isfinite(x)
@@ -200,6 +210,7 @@ class Support:
             "real vector": "real vectors",
             "counts": "vectors of counts",
             "positive definite": "positive definite matrices",
+            "increasing": "vectors whose components increase",
             "product": f"vectors whose parts are {'; '.join(_part(*part) for part in self.parts)}",
         }[self.kind]
 
@@ -237,6 +248,11 @@ positive_definite = Support("positive definite")
 def interval(low: Any, high: Any, open_low: bool = False, open_high: bool = False) -> Support:
     """The numbers from ``low`` to ``high``."""
     return Support("interval", low, high, open_low, open_high)
+
+
+def increasing(low: float = -np.inf, high: float = np.inf) -> Support:
+    """Vectors of numbers between two bounds, each at least the one before it."""
+    return Support("increasing", low, high)
 
 
 def integers(low: Any, high: Any = np.inf) -> Support:
@@ -304,6 +320,7 @@ _NAMED = {
     "nonnegative integer": integers(0),
     "counts": Support("counts"),
     "positive definite": positive_definite,
+    "increasing": increasing(),
 }
 
 

@@ -26,6 +26,7 @@ from bayesmc.gaussian import try_cholesky
 from bayesmc.shapes import Shape
 
 _TINY = np.finfo(float).tiny
+_LOG_STEP = 690.0  # many steps of exp(690) are still a double
 _LOG_ROOT = (
     354.0  # exp(2 * 354) is near the largest double, exp(-2 * 354) near the least normal one
 )
@@ -83,6 +84,9 @@ def transform_of(support: Support, event_shape: Shape = ()) -> Transform:
         return Bounded(event_shape, np.asarray(low), np.asarray(high))
     if kind == "product":
         return _side_by_side(support, event_shape)
+    if kind == "increasing":
+        low, high = (float(np.asarray(b).flat[0]) for b in (support.low, support.high))
+        return Increasing(event_shape, low, high)
     return {"circle": Wrapped, "simplex": StickBreaking, "positive definite": LogCholesky}[kind](
         event_shape
     )
@@ -298,6 +302,62 @@ class StickBreaking(Transform):
         return np.log(np.arange(self.event_shape[0] - 1, 0, -1))
 
 
+@dataclass(frozen=True, eq=False)
+class Increasing(Transform):
+    """Numbers in order between bounds, each finite or not: logarithms of how far each is from the next.
+
+    With no bound the first number stands for itself. Between two bounds the K + 1 steps are shares of the
+    whole (`StickBreaking`). Beyond 690 logarithms count as 690, for the sum of larger steps is no double.
+    """
+
+    low: float
+    high: float
+
+    def formula(self, u: Any) -> Any:
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            shares = self._shares.formula(u)[..., :-1]
+            return self.low + (self.high - self.low) * np.cumsum(shares, axis=-1)
+        if math.isfinite(self.low):
+            return self.low + np.cumsum(self._steps(u), axis=-1)
+        if math.isfinite(self.high):
+            return self.high - np.flip(np.cumsum(np.flip(self._steps(u), -1), axis=-1), -1)
+        return np.cumsum(np.concatenate([u[..., :1], self._steps(u[..., 1:])], axis=-1), axis=-1)
+
+    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
+        """Steps that rounding took away are the least there are, up, and then down from the bound."""
+        x, size = np.maximum(x, np.nextafter(self.low, np.inf)), self.event_shape[0]
+        for k in range(1, size):
+            x[..., k] = np.maximum(x[..., k], np.nextafter(x[..., k - 1], np.inf))
+        x[..., -1] = np.minimum(x[..., -1], np.nextafter(self.high, -np.inf))
+        for k in range(size - 1, 0, -1):
+            x[..., k - 1] = np.minimum(x[..., k - 1], np.nextafter(x[..., k], -np.inf))
+        return x
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
+        one = np.ones((*x.shape[:-1], 1))
+        ends = [self.low * one] * has_low, [self.high * one] * has_high
+        steps = np.diff(np.concatenate([*ends[0], x, *ends[1]], axis=-1), axis=-1)
+        if has_low and has_high:
+            return self._shares._unconstrain(steps / (self.high - self.low))
+        logs = np.log(steps)
+        return logs if has_low or has_high else np.concatenate([x[..., :1], logs], axis=-1)
+
+    def log_det_formula(self, u: Any) -> Any:
+        if math.isfinite(self.low) and math.isfinite(self.high):
+            wide = self.event_shape[0] * math.log(self.high - self.low)
+            return self._shares.log_det_formula(u) + wide
+        is_free = not (math.isfinite(self.low) or math.isfinite(self.high))
+        return np.sum(u[..., 1:] if is_free else u, axis=-1)
+
+    @property
+    def _shares(self) -> StickBreaking:
+        return StickBreaking((self.event_shape[0] + 1,))
+
+    def _steps(self, u: Any) -> Any:
+        return np.exp(np.minimum(u, _LOG_STEP))
+
+
 class LogCholesky(Transform):
     """Positive definite matrices ``L L'``, from the lower triangle of L with logs on its diagonal.
 
@@ -391,7 +451,7 @@ class SideBySide(Transform):
 def _check_event(support: Support, event_shape: Shape) -> None:
     axes = support.event_ndim
     fits = not axes or len(event_shape) == axes
-    if support.kind == "simplex":
+    if support.kind in ("simplex", "increasing"):
         fits = fits and event_shape[0] > 0
     elif support.kind == "positive definite":
         fits = fits and event_shape[0] == event_shape[1]

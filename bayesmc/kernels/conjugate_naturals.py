@@ -140,7 +140,7 @@ def why_not(blanket: Blanket, term: Term, prior: str) -> str:
 def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: Prior) -> Form | str:
     """Of numbers, by the features of prior and children."""
     if blanket.event_shape:
-        return f"a {prior.words} prior has no conjugate pair"
+        return f"the prior, {prior.words}, has no conjugate pair"
     terms = [t.expression for t in blanket.target.terms_of((blanket.name,))]
     if is_recursion([e for e in terms if e is not None], blanket.name):
         return "terms of its children are made of each other, and would be long if each were written out"
@@ -148,7 +148,7 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: Prior) -> F
     try:
         own = own_features(blanket, prior, of)
     except TraceError:
-        return f"a {prior.words} prior has no conjugate pair"
+        return f"the prior, {prior.words}, has no conjugate pair"
     low, high = prior.ends(blanket)
     found_children = children_of(blanket)
     if not isinstance(found_children, list):
@@ -265,7 +265,7 @@ def _of_events(
 ) -> Form | str:
     """Of vectors, shares and covariances."""
     if prior.is_bounded:
-        return f"a {prior.words} prior has no conjugate pair"
+        return f"the prior, {prior.words}, has no conjugate pair"
     of = moving(blanket, members, isinstance(family, DirichletConditional))
     naturals = naturals_of(blanket, prior.base)
     found = children_of(blanket)

@@ -346,7 +346,7 @@ def _as_family(result: Any) -> Family:
     try:
         return family_of(result)
     except TraceError:
-        raise TraceError(f"a {type(result).__name__} prior has no conjugate pair") from None
+        raise TraceError(f"the prior, {type(result).__name__}, has no conjugate pair") from None
 
 
 def _inverse(factor: Any) -> Any:

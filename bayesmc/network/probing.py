@@ -29,7 +29,15 @@ _MOST = 16
 #: the most that draws of a half line go from the middle
 _FROM_ZERO = 0.9
 #: supports that hold every point between two of theirs
-_CONVEX = ("real", "interval", "simplex", "real vector", "positive definite", "product")
+_CONVEX = (
+    "real",
+    "interval",
+    "simplex",
+    "real vector",
+    "positive definite",
+    "product",
+    "increasing",
+)
 
 
 def made_possible(model: Model, node: CompiledNode, result: Any, batch: Shape) -> bool:

@@ -21,6 +21,7 @@ from bayesmc.distributions import (
     Distribution,
     Joint,
     Mixture,
+    Ordered,
     Truncated,
     as_distribution,
 )
@@ -389,7 +390,7 @@ def _content(value: Any) -> Hashable:
 def _ranks(family: Family) -> dict[str, int]:
     """Axes of one value of each parameter, of parts of a mixture one for the part."""
     make, parameters = family.make, family.parameters
-    if make in (Affine, Truncated) and _is_scalar(parameters["base"]):
+    if make in (Affine, Ordered, Truncated) and _is_scalar(parameters["base"]):
         return {}
     if make is Mixture:
         return {"weights": 1, "components": int(isinstance(parameters["components"], Family))}

@@ -78,7 +78,7 @@ def family_of(dist: d.Distribution) -> Family:
         return Family(d.MvNormal, {k: _constant(v) for k, v in kept.items()})
     if isinstance(dist, d.Categorical):
         return Family(d.Categorical, {"probs": as_expression(dist.probs), "logits": None})
-    if isinstance(dist, (d.Affine, d.Truncated)):
+    if isinstance(dist, (d.Affine, d.Truncated, d.Ordered)):
         names = [
             k
             for k in inspect.signature(type(dist).__init__).parameters
@@ -417,6 +417,15 @@ def _truncated(x: Any, base: Any, low: Any, high: Any) -> Any:
     return _inside((x >= low) & (x <= high), _log_density(family, x) - mass)
 
 
+def _ordered(x: Any, base: Any, size: Any) -> Any:
+    family, count = _part(base), x.shape[-1]
+    each = [_log_density(family, x[..., k]) for k in range(count)]
+    total = sum(each, start=math.lgamma(count + 1.0))
+    if count == 1:
+        return total
+    return _inside(np.all(x[..., 1:] >= x[..., :-1], axis=-1), total)
+
+
 #: scale from which on a Fourier series has few terms
 _FOURIER = 1.25
 _MATRICES = frozenset((d.Wishart, d.InverseWishart))
@@ -430,7 +439,7 @@ _FORMS: Mapping[Any, Callable[..., Any]] = {
     d.Binomial: _binomial, d.Poisson: _poisson, d.Geometric: _geometric,
     d.NegativeBinomial: _negative_binomial, d.DiscreteUniform: _discrete_uniform,
     d.Categorical: _categorical, d.Multinomial: _multinomial, d.Mixture: _mixture,
-    d.Affine: _affine, d.Truncated: _truncated, d.WrappedNormal: _wrapped_normal,
+    d.Affine: _affine, d.Truncated: _truncated, d.Ordered: _ordered, d.WrappedNormal: _wrapped_normal,
     d.Wishart: partial(_matrices, is_inverse=False),
     d.InverseWishart: partial(_matrices, is_inverse=True),
 }  # fmt: skip

@@ -61,6 +61,8 @@ COLUMNS = {
     "Affine": d.Affine(d.Gamma(2.0, 1.0), COLUMN, -2.0),
     "Joint": d.Joint(d.Normal(COLUMN, 1.0), d.Gamma(COLUMN, 1.0)),
     "InverseCdf": d.InverseCdf(d.Density(lambda x: -np.abs(x) - 0 * COLUMN)),
+    "Ordered": d.Ordered(d.Normal(COLUMN, 1.0), 3),
+    "OrderedLogistic": d.OrderedLogistic(COLUMN, [-1.0, 0.0, 2.0]),
     "Geometric": d.Geometric(COLUMN),
     "NegativeBinomial": d.NegativeBinomial(3.0, COLUMN),
     "Multinomial": d.Multinomial(4, np.full((2, 1, 3), 1 / 3)),
@@ -162,7 +164,7 @@ def test_finite_tables_sum_to_one_and_equal_log_prob() -> None:
         np.testing.assert_allclose(table.sum(axis=-1), 1.0, rtol=1e-12)
         for k, value in enumerate(dist.support.values):
             np.testing.assert_allclose(table[..., k], np.exp(dist.log_prob(value)), rtol=1e-12)
-    assert tables == 7
+    assert tables == 8
 
 
 def test_bounds_that_depend_on_the_batch_have_no_common_size() -> None:

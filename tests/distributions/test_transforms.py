@@ -134,6 +134,14 @@ EXAMPLES: dict[str, tuple[Make, ...]] = {
     ),
     "NegativeBinomial": (lambda: d.NegativeBinomial(2.0, 0.3),),
     "Normal": (lambda: d.Normal(0.0, 1.0), lambda: d.Normal([0.0, 1.0], [[1.0], [2.0]])),
+    "Ordered": (
+        lambda: d.Ordered(d.Normal(0.0, 1.0), 1),
+        lambda: d.Ordered(d.Normal([0.0, 5.0], [[1.0], [2.0]]), 4),
+        lambda: d.Ordered(d.Exponential([1.0, 20.0]), 3),
+        lambda: d.Ordered(d.Uniform(-1.0, 2.0), 3),
+        lambda: d.Ordered(d.Affine(d.Gamma(2.0, 1.0), 3.0, -1.0), 3),
+    ),
+    "OrderedLogistic": (lambda: d.OrderedLogistic(0.0, [-1.0, 1.0]),),
     "Poisson": (lambda: d.Poisson(3.0),),
     "StudentT": (lambda: d.StudentT(5.0, 0.0, 1.0), lambda: d.StudentT([5.0, 9.0], 0.0, 1.0)),
     "Truncated": (

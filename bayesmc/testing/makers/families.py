@@ -208,6 +208,20 @@ def _ordered(p: _Parameters) -> str:
     return f"{array(low)}, {array(low + width)}"
 
 
+def _increasing(p: _Parameters) -> str:
+    """What numbers in order are drawn from: on the line, above zero, between two bounds, below one."""
+    return p.choices.pick(
+        (f"bmc.Normal({p.real()}, {p.positive()})", "bmc.Exponential(2.0)", "bmc.Uniform(-1.0, 2.0)",
+         "bmc.Affine(bmc.Exponential(0.5), 1.0, -1.0)")
+    )  # fmt: skip
+
+
+def _cutpoints(p: _Parameters) -> str:
+    shape = (*p.shape(), p.choices.integer(1, 3))
+    steps = [p._positive(-3, 3) for _ in range(math.prod(shape))]
+    return array(np.cumsum(np.reshape(steps, shape), axis=-1) - 2.0)
+
+
 def _truncated(p: _Parameters) -> str:
     loc, scale = p.values(p._real), p._positive(-4, 4)
     # the tails of the extreme ones, up to ten standard deviations out
@@ -315,6 +329,10 @@ _FAMILIES: dict[str, _Family] = {
     "Joint": _Family(_joint, 1),
     "Multinomial": _Family(
         lambda p: f"bmc.Multinomial({p.count()}, {p.rows(p.choices.integer(2, 4))})", 1, True
+    ),
+    "Ordered": _Family(lambda p: f"bmc.Ordered({_increasing(p)}, {p.choices.integer(1, 4)})", 1),
+    "OrderedLogistic": _Family(
+        lambda p: f"bmc.OrderedLogistic({p.real()}, {_cutpoints(p)})", 0, True
     ),
     "Wishart": _Family(_matrix("Wishart"), 2),
     "InverseWishart": _Family(_matrix("InverseWishart"), 2),
