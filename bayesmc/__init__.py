@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from bayesmc import errors
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
+    LKJ,
     Affine,
     Bernoulli,
     Beta,
@@ -100,6 +101,7 @@ if TYPE_CHECKING:
 __version__ = "0.2.0"
 
 __all__ = [
+    "LKJ",
     "Affine",
     "AssumedDensity",
     "BayesNet",

@@ -19,6 +19,7 @@ from bayesmc.distributions.discrete import Bernoulli, Binomial, DiscreteUniform,
 from bayesmc.distributions.inverse_cdf import InverseCdf
 from bayesmc.distributions.joint import Joint
 from bayesmc.distributions.kernel import KernelDensity
+from bayesmc.distributions.lkj import LKJ
 from bayesmc.distributions.location_scale import Cauchy, HalfCauchy, HalfNormal, Laplace
 from bayesmc.distributions.mixture import Mixture
 from bayesmc.distributions.mvnormal import MvNormal
@@ -30,6 +31,7 @@ from bayesmc.distributions.truncated import Truncated
 from bayesmc.distributions.wishart import InverseWishart, Wishart
 
 __all__ = [
+    "LKJ",
     "Affine",
     "Bernoulli",
     "Beta",

@@ -200,6 +200,10 @@ def _points(support: Support, event_shape: Shape) -> list[np.ndarray]:
         return [np.full(size, 1 / size), ramp / ramp.sum()]
     if kind == "positive definite":
         return [np.eye(event_shape[0]), 2.0 * np.eye(event_shape[0])]
+    if kind == "correlation":
+        return [np.eye(event_shape[0]), 0.5 * (np.eye(event_shape[0]) + 1.0)]
+    if kind == "increasing":
+        return [_in_order(support, event_shape[0], share) for share in (0.5, 0.8125)]
     if kind == "counts":
         return [np.zeros(event_shape), np.ones(event_shape)]
     if kind in ("interval", "integers"):
@@ -209,6 +213,14 @@ def _points(support: Support, event_shape: Shape) -> list[np.ndarray]:
     else:
         places = [0.375, -1.25]
     return [np.full(event_shape, place) for place in places]
+
+
+def _in_order(support: Support, size: int, share: float) -> np.ndarray:
+    low, high = float(np.max(support.low)), float(np.min(support.high))
+    if not np.isfinite(low):
+        low = high - size if np.isfinite(high) else -1.25
+    high = high if np.isfinite(high) else low + size
+    return low + (high - low) * share * np.arange(1.0, size + 1) / (size + 1)
 
 
 def _numbers(low: float, high: float) -> list[float]:

@@ -22,6 +22,7 @@ _EVENT_NDIM = {
     "counts": 1,
     "product": 1,
     "increasing": 1,
+    "correlation": 2,
 }
 
 
@@ -33,7 +34,7 @@ class Support:
     ----------
     kind : str
         ``"real"``, ``"interval"``, ``"circle"``, ``"integers"``, ``"simplex"``, ``"real vector"``,
-        ``"counts"``, ``"positive definite"``, ``"increasing"`` or ``"product"``.
+        ``"counts"``, ``"positive definite"``, ``"correlation"``, ``"increasing"`` or ``"product"``.
     low, high : float or array
         Bounds of an interval, of integers (inclusive) or of numbers in order, possibly infinite; arrays when
         they depend on parents.
@@ -146,6 +147,9 @@ class Support:
         if self.kind == "positive definite":
             bad = try_cholesky(x)[1]
             return np.ones(x.shape[:-2], dtype=bool) if bad is None else ~bad
+        if self.kind == "correlation":
+            ones = (np.abs(np.linalg.diagonal(x) - 1) <= 1e-6).all(axis=-1)
+            return ones & positive_definite.contains(x)
         if self.kind == "product":
             return self._parts_contain(x)
         if self.kind == "increasing":
@@ -210,6 +214,7 @@ class Support:
             "real vector": "real vectors",
             "counts": "vectors of counts",
             "positive definite": "positive definite matrices",
+            "correlation": "correlation matrices",
             "increasing": "vectors whose components increase",
             "product": f"vectors whose parts are {'; '.join(_part(*part) for part in self.parts)}",
         }[self.kind]
@@ -243,6 +248,7 @@ circle = Support("circle")
 simplex = Support("simplex")
 real_vector = Support("real vector")
 positive_definite = Support("positive definite")
+correlation = Support("correlation")
 
 
 def interval(low: Any, high: Any, open_low: bool = False, open_high: bool = False) -> Support:
@@ -320,6 +326,7 @@ _NAMED = {
     "nonnegative integer": integers(0),
     "counts": Support("counts"),
     "positive definite": positive_definite,
+    "correlation": correlation,
     "increasing": increasing(),
 }
 
@@ -352,7 +359,7 @@ def _components(support: Support) -> list[Support]:
 
 
 def _covers(mine: Support, other: Support) -> bool:
-    if mine.kind in ("simplex", "positive definite"):
+    if mine.kind in ("simplex", "positive definite", "correlation"):
         return mine.kind == other.kind
     (low, high), (least, most) = _range(mine), _range(other)
     return not (_above(low, least) or _above(most, high))

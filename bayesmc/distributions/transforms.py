@@ -20,16 +20,14 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions.intervals import PIECES, is_finite
+from bayesmc.distributions.matrix_transforms import LogCholesky, PartialCorrelations
 from bayesmc.distributions.support import Support
+from bayesmc.distributions.transform import Transform
 from bayesmc.errors import ShapeError, UnsupportedError
-from bayesmc.gaussian import try_cholesky
 from bayesmc.shapes import Shape
 
 _TINY = np.finfo(float).tiny
 _LOG_STEP = 690.0  # many steps of exp(690) are still a double
-_LOG_ROOT = (
-    354.0  # exp(2 * 354) is near the largest double, exp(-2 * 354) near the least normal one
-)
 
 
 def transform_of(support: Support, event_shape: Shape = ()) -> Transform:
@@ -85,93 +83,9 @@ def transform_of(support: Support, event_shape: Shape = ()) -> Transform:
     if kind == "product":
         return _side_by_side(support, event_shape)
     if kind == "increasing":
-        low, high = (float(np.asarray(b).flat[0]) for b in (support.low, support.high))
-        return Increasing(event_shape, low, high)
-    return {"circle": Wrapped, "simplex": StickBreaking, "positive definite": LogCholesky}[kind](
-        event_shape
-    )
-
-
-@dataclass(frozen=True, eq=False)
-class Transform:
-    """A map ``u -> x`` from unconstrained numbers to the values of a support.
-
-    Made by ``transform_of``. Arrays have any leading axes, which broadcast with those of the bounds.
-
-    Attributes
-    ----------
-    event_shape : tuple of int
-        Shape of one value x.
-    unconstrained_shape : tuple of int
-        Shape of the numbers u behind one value.
-
-    Notes
-    -----
-    ``constrain`` takes every finite u to a finite x, inside the open support as far as floating
-    point can tell. ``unconstrain`` raises for no value: a bound that the open support excludes
-    gives infinite or NaN numbers, a value beyond it NaN. ``formula`` and ``log_det_formula`` take what stands
-    for an array, too, so that derivatives come of the same lines; bounds may be such stand-ins.
-
-    Examples
-    --------
-    >>> import bayesmc as bmc
-    >>> logit = bmc.Beta(2.0, 3.0).transform
-    >>> logit.constrain(0.0).tolist(), logit.unconstrain([0.5, 0.0, 2.0]).tolist()
-    (0.5, [0.0, -inf, nan])
-    """
-
-    event_shape: Shape
-
-    @property
-    def unconstrained_shape(self) -> Shape:
-        """Shape of the unconstrained numbers behind one value."""
-        return self.event_shape
-
-    @property
-    def angles(self) -> np.ndarray:
-        """Which unconstrained numbers are angles, the same again after a turn; their shape."""
-        return np.zeros(self.unconstrained_shape, bool)
-
-    def constrain(self, u: Any) -> np.ndarray:
-        """The value at ``u``, shape ``(..., *event_shape)`` from ``(..., *unconstrained_shape)``."""
-        with np.errstate(all="ignore"):
-            at = _checked(self, u, self.unconstrained_shape)
-            return np.asarray(self._kept_inside(self.formula(at)))
-
-    def unconstrain(self, x: Any) -> np.ndarray:
-        """The numbers behind ``x``, shape ``(..., *unconstrained_shape)``."""
-        with np.errstate(all="ignore"):
-            return np.asarray(self._unconstrain(_checked(self, x, self.event_shape)))
-
-    def log_abs_det_jacobian(self, u: Any) -> np.ndarray:
-        """``log |det dx/du|`` at ``u``, summed over the event.
-
-        For dependent coordinates the volume is that of the first K - 1 components of a simplex and
-        of the lower triangle of a symmetric matrix. The shape is the broadcast of the leading axes
-        of ``u`` and of the bounds.
-        """
-        with np.errstate(all="ignore"):
-            return np.asarray(self.log_det_formula(_checked(self, u, self.unconstrained_shape)))
-
-    def formula(self, u: Any) -> Any:
-        """The map alone, of an array or of what stands for one: far out it may round onto a bound."""
-        raise NotImplementedError
-
-    def log_det_formula(self, u: Any) -> Any:
-        """The formula of ``log_abs_det_jacobian``, of an array or of what stands for one."""
-        raise NotImplementedError
-
-    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
-        """Values of the formula, those on a bound next to it."""
-        return x
-
-    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
-
-    def _summed(self, terms: np.ndarray) -> np.ndarray:
-        """``terms`` of single numbers, added over the event axes."""
-        axes = tuple(range(terms.ndim - len(self.event_shape), terms.ndim))
-        return terms.sum(axis=axes) if axes else terms
+        least, most = (float(np.asarray(b).flat[0]) for b in (support.low, support.high))
+        return Increasing(event_shape, least, most)
+    return _OF_KIND[kind](event_shape)
 
 
 class Identity(Transform):
@@ -358,48 +272,12 @@ class Increasing(Transform):
         return np.exp(np.minimum(u, _LOG_STEP))
 
 
-class LogCholesky(Transform):
-    """Positive definite matrices ``L L'``, from the lower triangle of L with logs on its diagonal.
-
-    The d (d + 1) / 2 numbers go row by row. Beyond 354 logs on the diagonal count as 354, for the
-    squares of larger ones are no doubles.
-    """
-
-    @property
-    def unconstrained_shape(self) -> Shape:
-        d = self.event_shape[0]
-        return (d * (d + 1) // 2,)
-
-    def formula(self, u: Any) -> Any:
-        d, lead = self.event_shape[0], u.shape[:-1]
-        row, column = np.tril_indices(d)
-        logs = u[..., np.flatnonzero(row == column)]
-        roots = np.exp(np.clip(logs, -_LOG_ROOT, _LOG_ROOT))
-        parts = [u, roots, np.zeros((*lead, 1))]
-        at = np.full((d, d), row.size + d)  # the zero behind them
-        at[row, column] = np.arange(row.size)
-        at[np.arange(d), np.arange(d)] = row.size + np.arange(d)
-        factor = np.take(np.concatenate(parts, axis=-1), at, axis=-1)
-        x = np.reshape(factor @ np.matrix_transpose(factor), (*lead, d * d))
-        here = np.arange(d * d).reshape(d, d)
-        lower = np.tril(here) + np.tril(here, -1).T
-        return np.take(x, lower, axis=-1)  # symmetric to the last bit
-
-    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
-        d = self.event_shape[0]
-        i = np.arange(d)
-        factor, bad = try_cholesky(x)
-        factor = np.array(factor)
-        factor[..., i, i] = np.log(factor[..., i, i])
-        u = factor[..., *np.tril_indices(d)]
-        return u if bad is None else np.where(bad[..., None], np.nan, u)
-
-    def log_det_formula(self, u: Any) -> Any:
-        d = self.event_shape[0]
-        row, column = np.tril_indices(d)
-        # L -> L L' stretches by 2^d prod L_ii^(d - i), i from 0; the logarithm adds one L_ii each
-        logs = u[..., np.flatnonzero(row == column)]
-        return d * math.log(2.0) + logs @ np.arange(d + 1.0, 1.0, -1.0)
+_OF_KIND: dict[str, Callable[[Shape], Transform]] = {
+    "circle": Wrapped,
+    "simplex": StickBreaking,
+    "positive definite": LogCholesky,
+    "correlation": PartialCorrelations,
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -453,7 +331,7 @@ def _check_event(support: Support, event_shape: Shape) -> None:
     fits = not axes or len(event_shape) == axes
     if support.kind in ("simplex", "increasing"):
         fits = fits and event_shape[0] > 0
-    elif support.kind == "positive definite":
+    elif support.kind in ("positive definite", "correlation"):
         fits = fits and event_shape[0] == event_shape[1]
     elif support.kind == "product":
         fits = fits and event_shape[0] == sum(max(count, 1) for _, count in support.parts)
@@ -464,16 +342,6 @@ def _check_event(support: Support, event_shape: Shape) -> None:
 def _side_by_side(support: Support, event_shape: Shape) -> Transform:
     parts = [transform_of(part, (count,) if count else ()) for part, count in support.parts]
     return SideBySide(event_shape, tuple(parts))
-
-
-def _checked(transform: Transform, value: Any, shape: Shape) -> np.ndarray:
-    value = np.asarray(value, dtype=float)
-    cut = value.ndim - len(shape)
-    if cut < 0 or value.shape[cut:] != shape:
-        raise ShapeError(
-            f"{type(transform).__name__}: the values have shape {value.shape}, not (..., *{shape})"
-        )
-    return value
 
 
 def _width(shape: Shape) -> int:

@@ -35,6 +35,7 @@ _CONVEX = (
     "simplex",
     "real vector",
     "positive definite",
+    "correlation",
     "product",
     "increasing",
 )

@@ -28,6 +28,7 @@ from bayesmc.expression.composed import log_sum_exp
 from bayesmc.expression.graph import cast
 from bayesmc.passes.interval_mass import log_mass
 from bayesmc.passes.joints import VECTORS, is_joint, places
+from bayesmc.passes.matrix_density import correlations, wishart
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -334,28 +335,6 @@ def _multinomial(x: Any, total_count: Any, probs: Any, logits: Any) -> Any:
     return _inside(fits, density)
 
 
-def _log_det(root: Any) -> Any:
-    """Of a matrix, by its Cholesky factor."""
-    return 2.0 * np.sum(np.log(np.linalg.diagonal(root)), axis=-1)
-
-
-def _matrices(x: Any, df: Any, scale: Any, is_inverse: bool) -> Any:
-    size = x.shape[-1]
-    root, of_scale = np.linalg.cholesky(x), np.linalg.cholesky(scale)
-    first, second = (root, of_scale) if is_inverse else (of_scale, root)
-    z = np.matmul(np.linalg.inv(first), second)
-    trace_of = np.sum(z * z, axis=(-2, -1))
-    halves = 0.5 * (np.reshape(df, (*np.shape(df), 1)) - np.arange(size))
-    norm = 0.5 * df * size * math.log(2.0) + 0.25 * size * (size - 1) * math.log(math.pi)
-    norm = norm + np.sum(special.gammaln(halves), axis=-1)
-    if is_inverse:
-        logs = 0.5 * df * _log_det(of_scale) - 0.5 * (df + size + 1) * _log_det(root)
-    else:
-        logs = 0.5 * (df - size - 1) * _log_det(root) - 0.5 * df * _log_det(of_scale)
-    # fewer degrees of freedom have no density, though the gamma function has values there
-    return logs - 0.5 * trace_of - norm + np.where(df > size - 1, 0.0, -np.inf)
-
-
 def _wrapped_normal(x: Any, loc: Any, scale: Any) -> Any:
     turn = 2 * math.pi
     off = x - loc
@@ -439,7 +418,8 @@ _FORMS: Mapping[Any, Callable[..., Any]] = {
     d.Binomial: _binomial, d.Poisson: _poisson, d.Geometric: _geometric,
     d.NegativeBinomial: _negative_binomial, d.DiscreteUniform: _discrete_uniform,
     d.Categorical: _categorical, d.Multinomial: _multinomial, d.Mixture: _mixture,
-    d.Affine: _affine, d.Truncated: _truncated, d.Ordered: _ordered, d.WrappedNormal: _wrapped_normal,
-    d.Wishart: partial(_matrices, is_inverse=False),
-    d.InverseWishart: partial(_matrices, is_inverse=True),
+    d.Affine: _affine, d.Truncated: _truncated, d.Ordered: _ordered, d.LKJ: correlations,
+    d.WrappedNormal: _wrapped_normal,
+    d.Wishart: partial(wishart, is_inverse=False),
+    d.InverseWishart: partial(wishart, is_inverse=True),
 }  # fmt: skip

@@ -142,6 +142,7 @@ _RANGES: Mapping[Any, Mapping[str, Callable[[Expression], Expression]]] = {
     d.Gamma: {"concentration": _positive},
     d.InverseGamma: {"concentration": _positive},
     d.Dirichlet: {"concentration": _positive_vector},
+    d.LKJ: {"concentration": _positive},
     d.VonMises: {"concentration": _nonnegative},
     d.Poisson: {"rate": _nonnegative},
     d.Bernoulli: {"probs": _unit},

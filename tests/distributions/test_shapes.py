@@ -61,6 +61,7 @@ COLUMNS = {
     "Affine": d.Affine(d.Gamma(2.0, 1.0), COLUMN, -2.0),
     "Joint": d.Joint(d.Normal(COLUMN, 1.0), d.Gamma(COLUMN, 1.0)),
     "InverseCdf": d.InverseCdf(d.Density(lambda x: -np.abs(x) - 0 * COLUMN)),
+    "LKJ": d.LKJ(3, COLUMN),
     "Ordered": d.Ordered(d.Normal(COLUMN, 1.0), 3),
     "OrderedLogistic": d.OrderedLogistic(COLUMN, [-1.0, 0.0, 2.0]),
     "Geometric": d.Geometric(COLUMN),
@@ -112,7 +113,7 @@ def test_inner_axes_of_size_one_get_independent_draws(name: str) -> None:
     dist = COLUMNS[name]
     draws = dist.sample_to(np.random.default_rng(2), (700, 2, 200)).astype(float)
     if dist.event_shape:
-        draws = draws.reshape((700, 2, 200, -1))[..., 0]
+        draws = draws.reshape((700, 2, 200, -1))[..., len(dist.event_shape) - 1]
     if not isinstance(dist, d.Density) and not np.isfinite(dist.var).all():
         draws = np.arctan(draws)  # Cauchy's have no variance
     for row in range(2):

@@ -18,6 +18,8 @@ from bayesmc.distributions.support import (
     Support,
     as_support,
     circle,
+    correlation,
+    increasing,
     integers,
     interval,
     positive,
@@ -115,6 +117,11 @@ EXAMPLES: dict[str, tuple[Make, ...]] = {
     "KernelDensity": (
         lambda: d.KernelDensity([0.0, 1.0, 3.0]),
         lambda: d.KernelDensity([[0.0, 1.0], [2.0, 0.0], [1.0, 1.5]], vectors=True),
+    ),
+    "LKJ": (
+        lambda: d.LKJ(1),
+        lambda: d.LKJ(2, [[1.0], [5.0]]),
+        lambda: d.LKJ(4, 2.0),
     ),
     "Laplace": (lambda: d.Laplace(0.0, 1.0), lambda: d.Laplace([0.0, 1.0], 2.0)),
     "LogNormal": (lambda: d.LogNormal(0.0, 1.0), lambda: d.LogNormal([0.0, 1.0], [[1.0], [0.5]])),
@@ -270,6 +277,8 @@ def coordinates(support: Support, event: tuple[int, ...], x: np.ndarray) -> np.n
         return x[..., :-1]
     if support.kind == "positive definite":
         return x[..., *np.tril_indices(event[0])]
+    if support.kind == "correlation":
+        return x[..., *np.tril_indices(event[0], -1)]
     if support.kind == "product":
         parts, start = [], 0
         for part, count in support.parts:
@@ -319,7 +328,10 @@ def test_far_out_nothing_is_nan(name: str, k: int) -> None:
         with np.errstate(all="raise"):
             x, log_det = transform.constrain(u), transform.log_abs_det_jacobian(u)
         assert np.isfinite(x).all() and np.isfinite(log_det).all()
-        if dist.support.kind != "positive definite":  # such matrices are singular to rounding
+        if dist.support.kind not in (
+            "positive definite",
+            "correlation",
+        ):  # such matrices are singular to rounding
             assert dist.support.contains(x).all()
             assert np.isfinite(transform.unconstrain(x)).all()  # not on an open bound
 
@@ -350,6 +362,11 @@ KINDS: dict[str, tuple[Support, tuple[int, ...], tuple[int, ...]]] = {
     "simplex": (simplex, (5,), ()),
     "real vector": (real_vector, (3,), ()),
     "positive definite": (positive_definite, (4, 4), ()),
+    "correlation": (correlation, (4, 4), ()),
+    "increasing": (increasing(), (4,), ()),
+    "increasing from below": (increasing(-1.0), (3,), ()),
+    "increasing up to": (increasing(-INF, 2.0), (3,), ()),
+    "increasing between": (increasing(-1.0, 3.0), (3,), ()),
     "product": (BOTH, (10,), (2,)),
 }
 

@@ -198,7 +198,10 @@ def _check_walk(model: Model, key: Key, walk: RandomWalk, what: str) -> None:
                     f"{what}: {name!r} is discrete, so the scale is one number, the largest jump, 1 or more, "
                     "and does not adapt; for jumps that adapt leave it to the default"
                 )
-        elif support.kind in ("simplex", "positive definite") and not walk.unconstrained:
+        elif (
+            support.kind in ("simplex", "positive definite", "correlation")
+            and not walk.unconstrained
+        ):
             raise ModelError(
                 f"{what}: {name!r} takes {support.describe()}, and a step on that scale leaves them; "
                 "use RandomWalk(scale, unconstrained=True)"

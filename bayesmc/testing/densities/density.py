@@ -366,7 +366,7 @@ def _outer(element: Element, points: np.ndarray) -> Iterator[np.ndarray]:
             value = np.zeros(shape)
             value[:2] = 1.5, -0.5
             yield value
-    elif kind == "positive definite":
+    elif kind in ("positive definite", "correlation"):
         yield -np.eye(shape[0])
     elif kind == "counts":
         yield np.full(shape, -1.0)

@@ -334,6 +334,9 @@ _FAMILIES: dict[str, _Family] = {
     "OrderedLogistic": _Family(
         lambda p: f"bmc.OrderedLogistic({p.real()}, {_cutpoints(p)})", 0, True
     ),
+    "LKJ": _Family(
+        lambda p: f"bmc.LKJ({p.choices.integer(1, 3)}, {p.positive(low=-1, high=3)})", 2
+    ),
     "Wishart": _Family(_matrix("Wishart"), 2),
     "InverseWishart": _Family(_matrix("InverseWishart"), 2),
 }
