@@ -24,6 +24,7 @@ _SAID: dict[str, str] = {
     "ess_threshold": "threshold ess_min essrmin ess_rmin",
     "resampling": "resample resample_method resampling_method scheme",
     "metric": "mass mass_matrix inv_metric",
+    "reparametrize": "centered centred noncentered reparam reparameterize",
 }
 #: words of those that count the warmup, too
 _ALL_ITERATIONS = "iter n_iter niter num_iter iterations n_iterations num_iterations".split()

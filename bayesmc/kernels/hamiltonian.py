@@ -7,12 +7,14 @@ become a kernel of nodes, and what was seen of trajectories is counted.
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from typing import Any, Protocol
 
 import numpy as np
 
-from bayesmc.errors import DensityError, EngineWarning, TraceError
+from bayesmc.errors import DensityError, EngineWarning, TraceError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory, counted
+from bayesmc.kernels.centring import Centring
 from bayesmc.kernels.compiled_transition import CompiledTransition
 from bayesmc.kernels.hamiltonian_warmup import (
     Bends,
@@ -25,9 +27,11 @@ from bayesmc.kernels.hamiltonian_warmup import (
 )
 from bayesmc.kernels.lost_chains import LostChains
 from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, Transition, transition
+from bayesmc.structure.centring import Effects
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.target import Values
+from bayesmc.structure.unconstrained import unconstrained_density
 
 #: gradients that a trajectory takes at least, on the whole
 GRADIENTS = 8
@@ -66,6 +70,8 @@ class Hamiltonian(Kernel):
     max_depth : int
         Doublings of a trajectory, at most.
     metric : "auto", "diagonal" or "dense"
+    reparametrize : bool
+        Whether effects are moved apart from their scale as far as suits them (``kernels.centring``).
     match : str
         Why these nodes move so, for the table of kernels.
     threads : int
@@ -117,6 +123,7 @@ class Hamiltonian(Kernel):
         target_accept: float = 0.8,
         max_depth: int = 10,
         metric: Metric = "auto",
+        reparametrize: bool = True,
         match: str = "",
         threads: int = 1,
         compiled: bool | None = None,
@@ -135,15 +142,18 @@ class Hamiltonian(Kernel):
         self.metric = MetricLearning(fitting(metric, density.size))
         #: what moves otherwise, too, is another density in each chain: none compares with the others
         self.lost = LostChains(0) if given else LostChains()
+        self.centring = Centring()
+        self._effects: Effects | None = None
+        if reparametrize and isinstance(density, UnconstrainedDensity):
+            self._effects = Effects(density)
+        self._declared, self._run = density, (0, 1)
+        self._shares = np.ones(density.size)
         self.ends, self.beginning = windows(warmup)
 
     def expect(self, steps: int, chains: int) -> None:
         """Gradients are machine code where so many steps pay for it."""
-        if isinstance(self.density, UnconstrainedDensity):
-            made = in_machine_code(self.density, self._calls(steps), chains, self.debug)
-            self.density, self._compiled = made, None
-            if made.trajectories is not None:
-                self._compiled = CompiledTransition(made.trajectories, made, self.threads)
+        self._run = steps, chains
+        self._use(self.density)
 
     def told(self, steps: int, chains: int) -> str:
         if not isinstance(self.density, UnconstrainedDensity):
@@ -151,6 +161,7 @@ class Hamiltonian(Kernel):
         return in_machine_code(self.density, self._calls(steps), chains).told
 
     def start(self, values: Values, chains: int) -> Memory:
+        self._centred(np.ones(self.density.size))
         u = self.density.unconstrain(values)
         log, slope = self._gradient(values)(u, np.arange(chains))
         if not (log > -np.inf).all():
@@ -163,6 +174,8 @@ class Hamiltonian(Kernel):
             "values": {n: values[n] for n in self.density.names},
             "metric": self.metric.start(slope),
             "lost": self.lost.start(*u.shape),
+            "shares": self._shares,
+            "effects": self._new_effects(),
             "step": self.step_size.start(np.zeros(chains)),
             "machine": self._compiled is not None,
             "sweep": 0,
@@ -182,6 +195,7 @@ class Hamiltonian(Kernel):
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
+        self._centred(memory["shares"])
         gradient = self._gradient(values)
         place = self._place(values, memory, gradient)
         if warmup and memory["sweep"] == 0:
@@ -197,7 +211,7 @@ class Hamiltonian(Kernel):
         kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
         kept["work"] = memory["work"] + np.array([found.calls, found.points])
         if warmup:
-            kept = self._learnt(gradient, place, kept, found.acceptance, rng)
+            kept = self._learnt(values, place, kept, found.acceptance, rng)
             return kept["values"], kept
         kept["divergences"] = kept["divergences"] + found.divergent
         kept["saturated"] = kept["saturated"] + (found.depth == self.max_depth)
@@ -210,6 +224,11 @@ class Hamiltonian(Kernel):
     def unsettled(self, memory: Memory) -> bool:
         """Whether a warmup should not end yet: steps were found too long when its last window ended."""
         return bool(memory["raised"] and memory["raised"] == memory["windows"])
+
+    def apart(self, memory: Mapping[str, Any]) -> frozenset[str]:
+        """Effects that are moved apart from their scale."""
+        places = {} if self._effects is None else self._effects.places
+        return frozenset(n for n, at in places.items() if (memory["shares"][at] < 1.0).any())
 
     def energy_ratio(self, memory: Memory) -> np.ndarray:
         """E-BFMI of every chain: mean square step of the energy over its variance.
@@ -296,7 +315,7 @@ class Hamiltonian(Kernel):
 
     def _learnt(
         self,
-        gradient: Gradient,
+        values: Values,
         place: Place,
         memory: Memory,
         acceptance: np.ndarray,
@@ -315,6 +334,9 @@ class Hamiltonian(Kernel):
         if pooled:
             memory = self._bent(memory)
             memory["lost"] = self.lost.seen(memory["lost"], place.u, place.log)
+            if self._effects is not None and self._effects.at.size:
+                told = self._effects.told({**values, **memory["values"]})
+                memory["effects"] = self.centring.seen(memory["effects"], *told)
         if sweep < self.ends[memory["windows"]]:
             return memory
         memory["windows"] += 1
@@ -324,7 +346,57 @@ class Hamiltonian(Kernel):
             place, memory = self._found_again(place, memory, lost, rng)
         else:
             memory["metric"] = self.metric.renewed(memory["metric"])
+            place, memory = self._recentred(values, place, memory)
+        memory["effects"] = self._new_effects()
+        gradient = self._gradient(values)
         return self._first_steps(gradient, place, memory, rng, self._is_pooled(memory))
+
+    def _recentred(self, values: Values, place: Place, memory: Memory) -> tuple[Place, Memory]:
+        """Effects as far apart from their scale as suits them, if a window is left to learn from."""
+        if self._effects is None or memory["windows"] == len(self.ends):
+            return place, memory
+        at, shares = self._effects.at, memory["shares"].copy()
+        shares[at] = self.centring.found(memory["effects"], shares[at])
+        if (shares == memory["shares"]).all():
+            return place, memory
+        try:
+            self._centred(shares)
+        except UnsupportedError:
+            self._centred(memory["shares"])
+            return place, memory
+        u = self.density.unconstrain({**values, **memory["values"]})
+        moved = Place(u, *self._gradient(values)(u, np.arange(len(u))))
+        if not all(np.isfinite(part).all() for part in moved):
+            self._centred(memory["shares"])
+            return place, memory
+        step = {**memory["step"], "target": self.step_size.target}
+        metric = self.metric.start(moved.slope)
+        changed = {"place": moved._asdict(), "metric": metric, "shares": shares, "step": step}
+        return moved, {**memory, **changed, "raised": memory["windows"]}
+
+    def _new_effects(self) -> dict[str, Any]:
+        return self.centring.start(0 if self._effects is None else self._effects.at.size)
+
+    def _use(self, density: Density) -> None:
+        """Move along a density, in machine code where the run is long enough."""
+        self.density, self._compiled = density, None
+        if isinstance(density, UnconstrainedDensity) and self._run[0]:
+            made = in_machine_code(density, self._calls(self._run[0]), self._run[1], self.debug)
+            self.density = made
+            if made.trajectories is not None:
+                self._compiled = CompiledTransition(made.trajectories, made, self.threads)
+
+    def _centred(self, shares: np.ndarray) -> None:
+        """Move effects with these shares of centring; which, is part of the memory."""
+        if np.array_equal(shares, self._shares):
+            return
+        declared, density = self._declared, self._declared
+        if isinstance(declared, UnconstrainedDensity) and (shares != 1.0).any():
+            density = unconstrained_density(
+                declared.target, declared.names, declared.summed, shares
+            )
+        self._use(density)
+        self._shares = shares
 
     def _found_again(
         self, place: Place, memory: Memory, lost: np.ndarray, rng: np.random.Generator

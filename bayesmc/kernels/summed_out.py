@@ -55,5 +55,7 @@ class SummedOut(Hamiltonian):
         new, memory = super().step(values, memory, rng, warmup)
         u = memory["place"]["u"]
         read = {**values, **new}
+        if self.apart(memory):  # states are drawn given the numbers as they are declared
+            u = self._declared.unconstrain(read)
         states, _ = self._states(u, rng, None, read)
         return {**new, **states}, memory

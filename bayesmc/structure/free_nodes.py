@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -34,6 +34,7 @@ from bayesmc.network import CompiledNode
 from bayesmc.network.expressions import Opaque
 from bayesmc.passes.support import moving_support
 from bayesmc.shapes import Shape
+from bayesmc.structure.centring import Centred, location_and_scale
 from bayesmc.structure.target import Target
 
 
@@ -53,7 +54,10 @@ class FreeNode:
     transform : Transform or None
         None where the bounds depend on parents.
     bounds : tuple of Expression
-        In this case: lower and upper, of stored values of parents, shape the plates.
+        In this case: lower and upper, of stored values of parents, shape the plates. Of an effect that is
+        moved apart from its scale: location and scale.
+    share : ndarray or None
+        Of such an effect, for each free number how far it is centred (``structure.centring``).
     by_component : bool
         Whether components of real vectors are hidden one by one.
     """
@@ -65,6 +69,7 @@ class FreeNode:
     transform: Transform | None
     bounds: tuple[Expression, ...] = ()
     by_component: bool = False
+    share: np.ndarray | None = None
 
     @property
     def name(self) -> str:
@@ -134,8 +139,7 @@ class FreeNode:
         u = TracedArray(pick([part], np.arange(self.size).reshape(self.lead + self.own_shape)))
         transform = self.transform
         if transform is None:
-            low, high = (self._moving(substituted(b, dict(above))) for b in self.bounds)
-            transform = Bounded(self.event, low, high)
+            transform = self._map(*(self._moving(substituted(b, dict(above))) for b in self.bounds))
         value = expression_of(transform.formula(u))
         volume = expression_of(transform.log_det_formula(u))
         volume = reduction(np.add, volume, range(len(volume.shape)))
@@ -176,9 +180,15 @@ class FreeNode:
         low, high = self._program(above)
         if self.elements is not None:
             low, high = (self._picked(b) for b in (low, high))
-        return Bounded(self.event, low, high)
+        return self._map(low, high)
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _map(self, low: Any, high: Any) -> Transform:
+        """The map between two bounds, or of an effect with this location and scale."""
+        if self.share is None:
+            return Bounded(self.event, low, high)
+        return Centred(self.event, low, high, self.share.reshape(self.lead + self.event))
 
     @property
     def _at(self) -> tuple[Any, ...]:
@@ -217,8 +227,21 @@ class FreeNode:
         return pick([constant(self.seen), value], at.reshape(shape))
 
 
-def free_node(target: Target, name: str, start: int) -> FreeNode:
+def free_node(
+    target: Target,
+    name: str,
+    start: int,
+    share: np.ndarray | None = None,
+    moving: Collection[str] = (),
+) -> FreeNode:
     """A node of the chain as free numbers.
+
+    Parameters
+    ----------
+    share : ndarray, optional
+        How far an effect is centred whose location and scale move with it, for each of its numbers.
+    moving : collection of str
+        What moves with it.
 
     Raises
     ------
@@ -239,6 +262,9 @@ def free_node(target: Target, name: str, start: int) -> FreeNode:
         known = np.broadcast_to(seen.numbers(len(node.event_shape)), node.value_shape)
         hidden = np.flatnonzero(~known)
         return FreeNode(node, start, hidden, value, transform_of(real, ()), by_component=True)
+    apart = None if share is None else location_and_scale(target, name, moving)
+    if apart is not None:
+        return FreeNode(node, start, elements, value, None, apart, share=share)
     if all(isinstance(b, (np.ndarray, float)) for b in (support.low, support.high)):
         if support.is_single:
             return FreeNode(node, start, elements, value, transform_of(support, node.event_shape))

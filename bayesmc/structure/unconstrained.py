@@ -46,7 +46,10 @@ _FEW = 12
 
 
 def unconstrained_density(
-    target: Target, names: Iterable[str] | None = None, summed: Iterable[str] = ()
+    target: Target,
+    names: Iterable[str] | None = None,
+    summed: Iterable[str] = (),
+    shares: np.ndarray | None = None,
 ) -> UnconstrainedDensity:
     """The log density of some continuous nodes given all others, on unconstrained numbers.
 
@@ -57,6 +60,8 @@ def unconstrained_density(
         Nodes of the chain that move; all continuous ones by default. The terms that they enter count.
     summed : iterable of str, optional
         Finite nodes of the chain that are summed out (``sum_out``); others are given by their values.
+    shares : ndarray, optional
+        For each free number how far it is centred, 1 as declared (``structure.centring``).
 
     Raises
     ------
@@ -78,7 +83,7 @@ def unconstrained_density(
     >>> density.labels, density.constrain(np.array([0.0])), density.with_gradient(np.array([0.0]))
     (['rate'], {'rate': array(1.)}, (np.float64(-6.484906649788), array([3.])))
     """
-    nodes = _laid_out(target, names)
+    nodes = _laid_out(target, names, shares)
     if not nodes:
         raise UnsupportedError("no hidden node is continuous: there are no unconstrained numbers")
     finite = [n for n in target.chain if n in set(summed)]
@@ -137,16 +142,25 @@ def without_volume(density: UnconstrainedDensity) -> UnconstrainedDensity:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _laid_out(target: Target, names: Iterable[str] | None) -> tuple[FreeNode, ...]:
+def _laid_out(
+    target: Target, names: Iterable[str] | None, shares: np.ndarray | None
+) -> tuple[FreeNode, ...]:
     """The nodes that move, one after the other."""
     found: list[FreeNode] = []
     wanted = None if names is None else set(names)
-    for name in target.chain:
-        node = target.model[name]
-        free = not node.is_discrete and node.domain is None
-        if free if wanted is None else name in wanted:
-            start = found[-1].start + found[-1].size if found else 0
-            found.append(free_node(target, name, start))
+    nodes = {n: target.model[n] for n in target.chain}
+    if wanted is None:
+        wanted = {n for n, node in nodes.items() if not node.is_discrete and node.domain is None}
+    for name in nodes:
+        if name not in wanted:
+            continue
+        start = found[-1].start + found[-1].size if found else 0
+        node = free_node(target, name, start)
+        if shares is not None:
+            own = shares[start : start + node.size]
+            if (own != 1.0).any():
+                node = free_node(target, name, start, own, wanted)
+        found.append(node)
     return tuple(found)
 
 

@@ -130,9 +130,9 @@ def test_of_several_scales_the_advice_names_that_of_the_trajectories_that_diverg
         kernels.append(kernel)
     nuts = Hamiltonian.__new__(Hamiltonian)
     assert "declare 'g' apart from the scale 'scale_g'" in _apart_from(
-        nuts, kernels, ["scale_g", "g"]
+        nuts, {}, kernels, ["scale_g", "g"]
     )
-    assert "declare 'a' apart from the scale 'scale_a'" in _apart_from(nuts, kernels)
+    assert "declare 'a' apart from the scale 'scale_a'" in _apart_from(nuts, {}, kernels)
 
 
 def test_the_advice_where_a_scale_is_not_found() -> None:

@@ -64,6 +64,12 @@ class HamiltonianMonteCarlo(ChainEngine):
         Whether finite nodes are summed out of the density where they can be, and drawn given the numbers:
         labels of a plate element by element, others by their joint states, at most 512 (`bmc.log_density`).
         Labels and numbers that cling to each other mix so. Without it they are drawn in turn.
+    reparametrize : bool
+        Whether effects (``Normal``, ``StudentT``, ``Laplace``, ``Cauchy`` or ``MvNormal`` nodes of several
+        numbers) are moved apart from their location and scale where these move, too, as far as suits each:
+        the warmup learns it from its draws. Without it trajectories follow the numbers as they are declared,
+        and a scale that the data say little of makes a funnel of them. The answer is in the nodes' own
+        numbers either way.
     metric : "auto", "diagonal" or "dense"
         Whether scales of all numbers are learnt, or their correlations, too. Dense up to 200 numbers where
         it is left open: by the draws and the gradients there correlations are learnt fast, and more numbers
@@ -89,7 +95,8 @@ class HamiltonianMonteCarlo(ChainEngine):
     References
     ----------
     Hoffman and Gelman (2014), JMLR 15; Betancourt (2017), A conceptual introduction to Hamiltonian Monte
-    Carlo, arXiv 1701.02434, appendix A; Stan Reference Manual, version 2.36, chapter "MCMC Sampling".
+    Carlo, arXiv 1701.02434, appendix A; Stan Reference Manual, version 2.36, chapter "MCMC Sampling";
+    Gorinova, Moore and Hoffman (2020), Automatic reparameterisation of probabilistic programs, ICML.
 
     Examples
     --------
@@ -112,6 +119,7 @@ class HamiltonianMonteCarlo(ChainEngine):
     target_accept: float = 0.8
     max_depth: int = 10
     marginalize: bool = False
+    reparametrize: bool = True
     metric: Metric = "auto"
     threads: int = field(default=1, compare=False)
     debug: bool = False
@@ -132,10 +140,10 @@ class HamiltonianMonteCarlo(ChainEngine):
                 f"{what}(target_accept={self.target_accept!r}): target_accept is a share between 0 and "
                 "1, such as 0.8"
             )
-        if not isinstance(self.marginalize, bool):
-            raise ValueError(
-                f"{what}(marginalize={self.marginalize!r}): marginalize is True or False"
-            )
+        for name in ("marginalize", "reparametrize"):
+            value = getattr(self, name)
+            if not isinstance(value, bool):
+                raise ValueError(f"{what}({name}={value!r}): {name} is True or False")
         if self.metric not in get_args(Metric):
             raise ValueError(
                 f'{what}(metric={self.metric!r}): metric is "auto", "diagonal" or "dense"'
@@ -213,6 +221,7 @@ class HamiltonianMonteCarlo(ChainEngine):
             target_accept=self.target_accept,
             max_depth=self.max_depth,
             metric=self.metric,
+            reparametrize=self.reparametrize,
             match=f"with all {density.size} free numbers, {fitting(self.metric, density.size)} metric",
             threads=self.threads,
             debug=self.debug,

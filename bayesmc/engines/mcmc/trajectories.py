@@ -23,8 +23,8 @@ from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.rescaled import Rescaled
 from bayesmc.results import ChainsPosterior, ChainsSums
 
-#: share of trajectories that may diverge by chance, as at the edge of a support
-_CHANCE = 1e-3
+#: share of trajectories that may diverge by chance, as at the edge of a support; standard errors beyond it
+_CHANCE, _ERRORS = 1e-3, 2.0
 #: share of trajectories that may be cut short
 _CUT = 0.01
 #: E-BFMI below which energies are explored too slowly (Betancourt 2016, sec. 5)
@@ -52,12 +52,14 @@ def faulty_trajectories(
             continue
         moves = memory["moves"] * len(memory["divergences"])
         diverged = int(memory["divergences"].sum())
-        if diverged > _CHANCE * moves:
+        expected = _CHANCE * moves
+        if diverged > expected + _ERRORS * np.sqrt(expected):
             names, where = _where(posterior, kernel)
+            apart = _apart_from(kernel, memory, kernels, names)
             yield (
                 f"{diverged} of {moves} trajectories diverged{where}: the density bends "
                 "there more sharply than their steps can follow, and draws leave it out; "
-                f"{_apart_from(kernel, kernels, names)}give tighter priors, or {_shorter(posterior, memory)}"
+                f"{apart}give tighter priors, or {_shorter(posterior, memory)}"
             )
         cut = int(memory["saturated"].sum())
         if cut > _CUT * moves:
@@ -69,7 +71,7 @@ def faulty_trajectories(
         if ratio < _LEAST_RATIO:
             yield (
                 f"energies change slowly (E-BFMI {ratio:.2f}, under {_LEAST_RATIO}): heavy tails or a funnel "
-                f"are not explored; {_apart_from(kernel, kernels)}declare heavy tails as a scale "
+                f"are not explored; {_apart_from(kernel, memory, kernels)}declare heavy tails as a scale "
                 "mixture, or give tighter priors"
             )
 
@@ -77,7 +79,12 @@ def faulty_trajectories(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _apart_from(kernel: Hamiltonian, kernels: list[Any], names: Sequence[str] = ()) -> str:
+def _apart_from(
+    kernel: Hamiltonian,
+    memory: Mapping[str, Any],
+    kernels: list[Any],
+    names: Sequence[str] = (),
+) -> str:
     """Effects that are to be declared apart from their scale, in words; empty where all are.
 
     Of several scales the first among ``names``, the nodes that tell where trajectories diverged.
@@ -93,10 +100,9 @@ def _apart_from(kernel: Hamiltonian, kernels: list[Any], names: Sequence[str] = 
     target: Any = getattr(kernel.density, "target", None)
     if target is None:
         return ""
-    terms, moved = target.terms, kernel.density.names
-    if any(
-        set(moved).intersection(target.hidden_above(terms[n])) - {n} for n in moved if n in terms
-    ):
+    terms, moved = target.terms, set(kernel.density.names)
+    own = [n for n in moved - kernel.apart(memory) if n in terms]
+    if any(moved.intersection(target.hidden_above(terms[n])) - {n} for n in own):
         return "declare effects apart from their scale (z ~ Normal(0, 1), b = sigma * z), "
     return ""
 
