@@ -9,6 +9,7 @@ from __future__ import annotations
 from bayesmc.distributions.adapt import as_distribution
 from bayesmc.distributions.affine import Affine
 from bayesmc.distributions.base import Distribution, marking_invalid
+from bayesmc.distributions.beta_binomial import BetaBinomial
 from bayesmc.distributions.categorical import Categorical
 from bayesmc.distributions.circular import VonMises, WrappedNormal
 from bayesmc.distributions.continuous import Beta, Exponential, Gamma, StudentT, Uniform
@@ -35,6 +36,7 @@ __all__ = [
     "Affine",
     "Bernoulli",
     "Beta",
+    "BetaBinomial",
     "Binomial",
     "Categorical",
     "Cauchy",

@@ -177,6 +177,7 @@ _REFUSED = {
     "circle": "an angle would not keep its period",
     "simplex": "probabilities would no longer sum to 1",
     "positive definite": "a matrix would not stay positive definite",
+    "increasing": "numbers in order may not keep their bounds or their order; move the base of Ordered",
     "correlation": "a correlation matrix would not keep ones on its diagonal",
 }
 

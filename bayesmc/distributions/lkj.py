@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import operator
 from typing import Any
 
 import numpy as np
 from scipy import special
 
-from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.base import Distribution, as_float, as_size
 from bayesmc.distributions.support import Support, correlation
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ShapeError
 from bayesmc.gaussian import try_cholesky
 from bayesmc.shapes import Shape
 
@@ -58,12 +57,7 @@ class LKJ(Distribution):
     parameter_ndim = {"concentration": 0}
 
     def __init__(self, size: int, concentration: Any = 1.0) -> None:
-        try:
-            self.size = operator.index(np.asarray(size)[()])
-        except TypeError:
-            raise ParameterError(f"LKJ: size must be a whole number; got {size!r}") from None
-        if self.size < 1:
-            raise ParameterError(f"LKJ: size must be at least 1; got {size!r}")
+        self.size = as_size("LKJ", size)
         concentration = as_float(concentration)
         self._set_batch(concentration.shape)
         self.event_shape = (self.size, self.size)

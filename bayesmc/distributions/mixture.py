@@ -304,7 +304,7 @@ def _hull(supports: Sequence[Support]) -> Support:
     if len(kinds) > 1:
         raise _not_mixed(supports)
     first = supports[0]
-    if first.kind not in ("interval", "integers"):
+    if first.kind not in ("interval", "integers", "increasing"):
         return first
     low, high = first.low, first.high
     for support in supports[1:]:

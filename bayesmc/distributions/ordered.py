@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from functools import cached_property
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions.adapt import as_distribution
-from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.base import Distribution, as_float, as_size
 from bayesmc.distributions.support import Support, increasing, integers
 from bayesmc.distributions.tails import tails_of
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
@@ -54,12 +53,7 @@ class Ordered(Distribution):
 
     def __init__(self, base: Any, size: int) -> None:
         self.base = _usable(base)
-        try:
-            self.size = operator.index(np.asarray(size)[()])
-        except TypeError:
-            raise ParameterError(f"Ordered: size must be a whole number; got {size!r}") from None
-        if self.size < 1:
-            raise ParameterError(f"Ordered: size must be at least 1; got {size!r}")
+        self.size = as_size("Ordered", size)
         self._set_batch(self.base.batch_shape)
         self._adopt(self.base)
         self.event_shape = (self.size,)
@@ -103,13 +97,19 @@ class Ordered(Distribution):
         z = z.reshape(-1, *(1,) * len(self.batch_shape))
         with np.errstate(all="ignore"):
             low, high = special.log_ndtr(z), special.log_ndtr(-z)
-            at = np.where(z < 0, tails.lower(low), tails.upper(high))
+            at = np.where(z < 0, tails.lower(low), tails.upper(high))[..., None]
         k = np.arange(1, self.size + 1)
         logs = (k - 1) * low[..., None] + (self.size - k) * high[..., None]
         logs = logs - special.betaln(k, self.size - k + 1) - 0.5 * np.square(z)[..., None]
         weights = np.exp(logs) * (step / np.sqrt(2 * np.pi))
-        mean = (weights * at[..., None]).sum(axis=0)
-        return mean, (weights * np.square(at[..., None] - mean)).sum(axis=0)
+        lost = np.where(np.isfinite(at), 0.0, weights).sum(axis=0)
+        if (lost > 1e-12).any():  # quantiles of other families end where their cdf is 1 to rounding
+            raise UnsupportedError(
+                f"Ordered: no quantiles of {type(self.base).__name__} are known far out; average draws"
+            )
+        at = np.where(np.isfinite(at), at, 0.0)
+        mean = (weights * at).sum(axis=0)
+        return mean, (weights * np.square(at - mean)).sum(axis=0)
 
     @property
     def support(self) -> Support:
@@ -168,6 +168,8 @@ class OrderedLogistic(Distribution):
     @staticmethod
     def log_density(x: Any, loc: Any, cutpoints: Any) -> Any:
         """Of the interval alone in which the value lies: two logistic functions, however many categories."""
+        if isinstance(cutpoints, (list, tuple)):
+            cutpoints = np.asarray(cutpoints)
         size = cutpoints.shape[-1]
         inside = (x >= 0) & (x <= size)
         at = np.where(inside, x, 0).astype(int)
@@ -235,8 +237,13 @@ def _usable(base: Any) -> Distribution:
     if support.kind not in ("real", "interval"):
         raise UnsupportedError(f"Ordered: {support.describe()} of {family} have no order")
     if not support.is_single:
-        raise UnsupportedError(
-            f"Ordered: the bounds of {family} differ within its batch or depend on parents; "
-            "sort numbers between 0 and 1, and stretch them in a function"
-        )
+        raise moving_order()
     return dist
+
+
+def moving_order() -> UnsupportedError:
+    """Why numbers in order have no bounds of their own for each element of a batch."""
+    return UnsupportedError(
+        "Ordered: the bounds of its base differ within a batch or depend on parents; sort numbers "
+        "between 0 and 1, Ordered(Uniform(0, 1), size), and stretch them in a function"
+    )

@@ -98,7 +98,7 @@ class Support:
     @property
     def at_most(self) -> Support:
         """What it lies in whatever the parents are: bounds that may differ for others are infinite."""
-        if self.kind not in ("interval", "integers") or self.is_single:
+        if self.kind not in ("interval", "integers", "increasing") or self.is_single:
             return self
         low, high = np.asarray(self.low), np.asarray(self.high)
         return Support(
@@ -207,6 +207,9 @@ class Support:
             if np.isfinite(low):
                 return f"{noun} {'>' if self.open_low else '>='} {low:g}"
             return f"{noun} {'<' if self.open_high else '<='} {high:g}"
+        if self.kind == "increasing" and self != increasing():
+            inner = interval(self.low, self.high).describe()
+            return f"vectors whose components increase, {inner}"
         return {
             "real": "real numbers",
             "circle": "angles in radians",

@@ -83,6 +83,10 @@ def transform_of(support: Support, event_shape: Shape = ()) -> Transform:
     if kind == "product":
         return _side_by_side(support, event_shape)
     if kind == "increasing":
+        if not support.is_single:
+            raise UnsupportedError(
+                "transform: numbers in order between bounds that differ have no map"
+            )
         least, most = (float(np.asarray(b).flat[0]) for b in (support.low, support.high))
         return Increasing(event_shape, least, most)
     return _OF_KIND[kind](event_shape)

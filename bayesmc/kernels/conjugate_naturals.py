@@ -355,7 +355,7 @@ def _form(family: Family, parameter: str, read: list[str]) -> str | None:
         found = statistics(
             log_density(Family(family.make, others), leaf("\0value", ())), "\0itself"
         )
-    except (TraceError, TypeError):
+    except (TraceError, TypeError, IndexError):  # of a vector or a matrix, which this is not
         return None
     if set(found.coefficients) == {1.0, 2.0}:
         return "mean"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -104,8 +104,7 @@ class Compared:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _doubts(self, values: Mapping[str, np.ndarray]) -> dict[Expression, np.ndarray]:
-        """How far rounding takes each root, the most of any element; no number where it decides on that."""
+    def _doubts(self, values: Mapping[str, np.ndarray]) -> dict[Expression, _Doubt]:
         found, roots = {}, self.run.roots
         others = Program(self.disturbed)(values)
         for root, a, b in zip(roots, self.run.program(values), others, strict=True):
@@ -113,14 +112,25 @@ class Compared:
             is_same = (a == b) | (np.isnan(a) & np.isnan(b))
             with np.errstate(invalid="ignore"):
                 off = np.where(is_same, 0.0, np.abs(np.subtract(a, b, dtype=float)))
-            found[root] = off.max(axis=event, keepdims=True)
+            open_ = ~np.isfinite(off)
+            found[root] = _Doubt(np.where(open_, 0.0, off).max(axis=event, keepdims=True), open_)
         return found
+
+
+class _Doubt(NamedTuple):
+    """How far rounding takes a root, the most of any element; where it decides whether there is a number."""
+
+    far: Any = 0.0
+    undecided: Any = False
+
+
+NO_DOUBT = _Doubt()
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _difference(found: np.ndarray, wanted: np.ndarray, doubt: Any = 0.0) -> str | None:
+def _difference(found: np.ndarray, wanted: np.ndarray, doubt: _Doubt = NO_DOUBT) -> str | None:
     if found.shape != wanted.shape:
         return f"has the shape {found.shape}, not {wanted.shape}"
     if wanted.dtype.kind != "f":
@@ -129,9 +139,10 @@ def _difference(found: np.ndarray, wanted: np.ndarray, doubt: Any = 0.0) -> str 
         finite = np.isfinite(wanted)
         scale = 1.0 + np.abs(wanted[finite]).max(initial=0.0)
         with np.errstate(all="ignore"):
-            near = np.abs(found - wanted) <= _RTOL * scale + _ROUNDINGS * doubt
+            near = np.abs(found - wanted) <= _RTOL * scale + _ROUNDINGS * doubt.far
         same = np.where(finite, near, (found == wanted) | (np.isnan(found) & np.isnan(wanted)))
-        same = same | np.isnan(doubt)
+        # two numbers have to be near each other all the same
+        same = same | (doubt.undecided & ~(np.isfinite(found) & np.isfinite(wanted)))
     if same.all():
         return None
     at = int(np.argmin(same))

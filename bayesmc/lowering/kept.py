@@ -15,7 +15,7 @@ from bayesmc.lowering.layout import (
     adds_in_place,
     cumulated_axis,
     is_given,
-    matrix_function,
+    linear_algebra,
 )
 from bayesmc.lowering.matrices import keep_matrices
 from bayesmc.lowering.places import flat, plus, times, unraveled
@@ -30,7 +30,7 @@ def keep(w: Writer, node: Expression) -> None:
     if isinstance(node, Call):
         if isinstance(node.call, (Scattered, Gathered)):
             _add_up(w, node)
-        elif matrix_function(node) is not None:
+        elif linear_algebra(node) is not None:
             keep_matrices(w, node)
         else:
             _cumulate(w, node, pointer)

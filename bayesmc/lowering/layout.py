@@ -149,7 +149,7 @@ def cumulated_axis(node: Call) -> int | None:
     return len(node.shape) + axis if is_plain and isinstance(axis, int) and axis < 0 else None
 
 
-def matrix_function(node: Expression) -> Any | None:
+def linear_algebra(node: Expression) -> Any | None:
     """NumPy's function of matrices that a call is, guarded or not; None where it is none with code."""
     made = node.call if isinstance(node, Call) else None
     if not isinstance(made, Repeated) or made.kwargs or made.output is not None:
@@ -190,14 +190,14 @@ def _check(node: Expression) -> None:
         raise TraceError(f"{node.ufunc.__name__}.reduce has no machine code")
     if isinstance(node, Call) and not _is_call_with_code(node):
         raise TraceError(f"{node.detail} has no machine code")
-    rows = node.operands[0].shape[-1] if matrix_function(node) is not None else 0
+    rows = node.operands[0].shape[-1] if linear_algebra(node) is not None else 0
     if rows > ROWS_MOST:
         raise TraceError(f"{node.detail} of {rows} rows has no machine code ({ROWS_MOST} at most)")
 
 
 def _is_call_with_code(node: Call) -> bool:
     is_sum = isinstance(node.call, (Scattered, Gathered))
-    return is_sum or cumulated_axis(node) is not None or matrix_function(node) is not None
+    return is_sum or cumulated_axis(node) is not None or linear_algebra(node) is not None
 
 
 def _demand(node: Expression, layout: Layout) -> None:

@@ -16,20 +16,21 @@ import numpy as np
 
 from bayesmc.expression import Call, Expression
 from bayesmc.lowering.code import REAL, TRUTH, WHOLE, Code, Module, Number
-from bayesmc.lowering.layout import matrix_function
+from bayesmc.lowering.elementary import elementary
+from bayesmc.lowering.layout import linear_algebra
 from bayesmc.lowering.places import flat
 from bayesmc.lowering.writer import Place, Writer
 
 
 def keep_matrices(w: Writer, node: Call) -> None:
     """Write the results of all matrices of a batch to the node's memory."""
-    function, code = matrix_function(node), w.code
+    function, code = linear_algebra(node), w.code
     size = node.operands[0].shape[-1]
     core = 0 if function is np.linalg.det else 2
     batch, columns = node.shape[: len(node.shape) - core], node.shape[-1] if core else 0
-    work, found = code.memory(size * size), code.memory(max(size * columns, 1))
+    work, found = w.scratch("work", size * size), w.scratch("found", max(size * columns, 1))
     is_triangle = (
-        function is np.linalg.inv and matrix_function(node.operands[0]) is np.linalg.cholesky
+        function is np.linalg.inv and linear_algebra(node.operands[0]) is np.linalg.cholesky
     )
 
     def each(at: Place) -> None:
@@ -84,7 +85,7 @@ def _called(code: Code, name: str, *arguments: str | int) -> Number:
     if not code.module.is_defined(f"bayesmc_{name}"):
         code.module.define(f"bayesmc_{name}", _FUNCTIONS[name](code.module))
     given = ", ".join(f"i64 {a}" if isinstance(a, int) else f"ptr {a}" for a in arguments)
-    return code.op(REAL, f"call double @bayesmc_{name}({given})")
+    return code.op(REAL, f"call double @bayesmc_{name}({given}) noinline")
 
 
 def _defined(c: Code, name: str, pointers: str, sizes: str, result: Number) -> str:
@@ -169,11 +170,14 @@ def _eliminated(module: Module) -> str:
     n, m, zero = _whole(c, "n"), _whole(c, "m"), c.number(0, WHOLE)
     a, x = _Matrix(c, "%a", n), _Matrix(c, "%x", m)
     good, det = c.variable(c.number(True, TRUTH)), c.variable(c.number(1.0))
+    size = c.variable(c.number(0.0))  # its logarithm: products of pivots overflow on the way
 
     def column(k: Number) -> None:
         _pivot_up(c, a, x, k, det)
         pivot = a[k, k]
-        c.set(det, c.get(det, REAL) * pivot)
+        c.set(det, c.get(det, REAL) * c.where(pivot < 0.0, c.number(-1.0), 1.0))
+        log = elementary(c, "log", c.call("llvm.fabs.f64", pivot))
+        c.set(size, c.get(size, REAL) + log)
         c.set(good, c.get(good, TRUTH) & pivot.ne(0.0))
 
         def below(i: Number) -> None:
@@ -195,7 +199,8 @@ def _eliminated(module: Module) -> str:
     c.span(zero, n, column)
     c.span(zero, n, back)
     x.nan_unless(good, n)
-    found = c.where(c.get(good, TRUTH), c.get(det, REAL), 0.0)
+    found = c.get(det, REAL) * elementary(c, "exp", c.get(size, REAL))
+    found = c.where(c.get(good, TRUTH), found, 0.0)
     return _defined(c, "eliminated", "a x", "n m", found)
 
 

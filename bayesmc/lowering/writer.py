@@ -69,6 +69,7 @@ class Writer:
         self._known: list[dict[tuple[Expression, Place], Number]] = [{}]
         self._tables: dict[str, list[np.ndarray]] = {kind: [] for kind in DTYPES}
         self._offsets: dict[Any, int] = {}
+        self._scratch: dict[tuple[str, int], str] = {}
 
     @property
     def constants(self) -> dict[str, np.ndarray]:
@@ -77,6 +78,12 @@ class Writer:
             kind: np.concatenate([*parts, np.zeros(1, DTYPES[kind])])
             for kind, parts in self._tables.items()
         }
+
+    def scratch(self, what: str, count: int) -> str:
+        """Where numbers have a place for a while: the same for all who ask for as many."""
+        if (what, count) not in self._scratch:
+            self._scratch[what, count] = self.code.memory(count)
+        return self._scratch[what, count]
 
     def loop(self, count: Any, body: Callable[[Number], None]) -> None:
         """What is emitted inside is not known outside."""

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Categorical, Distribution, as_distribution
+from bayesmc.distributions.ordered import moving_order
 from bayesmc.distributions.support import Support
 from bayesmc.errors import BayesmcError, ModelError, PlateError
 from bayesmc.network.labels import Domain
@@ -245,6 +246,8 @@ class Elementwise(Distribution):
     @property
     def support(self) -> Support:
         first = self.parts[0].support
+        if first.kind == "increasing" and any(p.support != first for p in self.parts):
+            raise moving_order()
         # bounds stay one per element, even if all are equal here: elsewhere they need not be
         if not self.batch_shape or first.kind not in ("interval", "integers"):
             return first

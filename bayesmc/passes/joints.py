@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
+
 from bayesmc import distributions as d
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression, Family
 
 #: families of vectors, whose size is that of a parameter
-VECTORS = frozenset((d.MvNormal, d.Dirichlet, d.Multinomial))
+VECTORS = frozenset((d.MvNormal, d.Dirichlet, d.Multinomial, d.Ordered))
 
 
 def is_joint(family: Family) -> bool:
@@ -60,6 +62,8 @@ def _side_by_side(family: Family, as_family: Callable[[Any], Family]) -> Iterato
 
 def _size(part: Family, as_family: Callable[[Any], Family]) -> int:
     """Components of a vector; 0 of a number."""
+    if part.make is d.Ordered:
+        return int(np.asarray(getattr(part.parameters["size"], "value", part.parameters["size"])))
     if part.make in VECTORS:
         known = [v for v in part.parameters.values() if isinstance(v, Expression) and v.shape]
         if known:

@@ -11,6 +11,7 @@ from scipy import special
 from bayesmc.distributions import (
     Affine,
     Beta,
+    BetaBinomial,
     Binomial,
     Distribution,
     Exponential,
@@ -139,6 +140,9 @@ FORMULAS: dict[Any, Callable[..., Any]] = {
     Exponential: lambda rate: 1.0 / rate,
     Poisson: lambda rate: rate,
     Binomial: _binomial,
+    BetaBinomial: lambda total_count, concentration1, concentration0: (
+        total_count * concentration1 / (concentration1 + concentration0)
+    ),
     Geometric: lambda probs, logits: 1.0 / _odds(probs, logits),
     NegativeBinomial: lambda total_count, probs, logits: total_count * _odds(probs, logits),
 }

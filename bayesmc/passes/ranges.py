@@ -23,6 +23,7 @@ from bayesmc.expression import (
     Pick,
     as_expression,
     elementwise,
+    pick,
     reduction,
 )
 from bayesmc.passes.arithmetic import is_all
@@ -129,6 +130,16 @@ def _positive_vector(x: Expression) -> Expression:
     return each if each is TRUE else reduction(np.logical_and, each, [len(x.shape) - 1])
 
 
+def _increasing(x: Expression) -> Expression:
+    """Vectors whose components are in order."""
+    last, size = len(x.shape) - 1, x.shape[-1]
+    if size == 1:
+        return TRUE
+    at = np.arange(x.size).reshape(x.shape)
+    pair = elementwise(np.greater_equal, pick([x], at[..., 1:]), pick([x], at[..., :-1]))
+    return reduction(np.logical_and, pair, [last])
+
+
 def _whole(n: Expression) -> Expression:
     if n.dtype.kind == "i" and not isinstance(n, Constant):
         return elementwise(np.greater_equal, n, 0)
@@ -147,6 +158,12 @@ _RANGES: Mapping[Any, Mapping[str, Callable[[Expression], Expression]]] = {
     d.Poisson: {"rate": _nonnegative},
     d.Bernoulli: {"probs": _unit},
     d.Binomial: {"probs": _unit, "total_count": _whole},
+    d.BetaBinomial: {
+        "total_count": _whole,
+        "concentration1": _positive,
+        "concentration0": _positive,
+    },
+    d.OrderedLogistic: {"cutpoints": _increasing},
     d.Geometric: {"probs": _unit},
     d.NegativeBinomial: {"probs": _unit, "total_count": _positive},
     d.Categorical: {"probs": _simplex},

@@ -125,3 +125,18 @@ def test_engines_find_the_posterior(engine: Any) -> None:
     assert abs(found - mean) / error < stats.norm.isf(5e-4)
     assert error < sd / 10  # less than a standard deviation's third would be seen
     np.testing.assert_allclose(post.std("R")[0, 1], sd, rtol=0.1)
+
+
+def test_a_concentration_that_is_hidden() -> None:
+    # R observed: the posterior of c by a lattice; false-alarm rate 1e-3 for each engine
+    net = bmc.BayesNet()
+    net.add("c", bmc.Gamma(2.0, 1.0))
+    net.add("R", lambda c: bmc.LKJ(3, c))
+    seen = matrix(0.6, 0.3, 0.5)
+    c = np.linspace(0.001, 30.0, 30_001)
+    logs = np.log(c) - c + bmc.LKJ(3, c).log_prob(np.broadcast_to(seen, (c.size, 3, 3)))
+    weights = np.exp(logs - logs.max())
+    exact = weights @ c / weights.sum()
+    for engine in (None, bmc.HamiltonianMonteCarlo(ess=2000), bmc.Gibbs(ess=2000)):
+        post = bmc.infer(net, {"R": seen}, engine=engine, rng=4)
+        assert abs(post.mean("c") - exact) / post.mcse("c") < stats.norm.isf(5e-4)

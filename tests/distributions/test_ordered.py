@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 from scipy import integrate, special, stats
 
 import bayesmc as bmc
-from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
+from bayesmc.errors import BayesmcError, ParameterError, ShapeError, UnsupportedError
 
 
 def test_the_density_is_that_of_all_arrangements() -> None:
@@ -68,7 +69,7 @@ def test_draws_have_the_law_of_order_statistics() -> None:
         (lambda: bmc.Ordered(bmc.Poisson(3.0), 2), UnsupportedError, "Poisson is discrete"),
         (lambda: bmc.Ordered(bmc.MvNormal([0, 0], np.eye(2)), 2), UnsupportedError, "vectors as values"),
         (lambda: bmc.Ordered(bmc.VonMises(0, 1), 2), UnsupportedError, "radians of VonMises have no"),
-        (lambda: bmc.Ordered(bmc.Uniform(0, [1, 2]), 2), UnsupportedError, "bounds of Uniform differ"),
+        (lambda: bmc.Ordered(bmc.Uniform(0, [1, 2]), 2), UnsupportedError, "bounds of its base differ"),
         (lambda: bmc.Ordered(bmc.Normal(0, 1), 2).log_prob([1.0, 2, 3]), ShapeError, r"not \(..., 2\)"),
         (lambda: bmc.Ordered(bmc.Cauchy(0, 1), 2).mean, UnsupportedError, "no finite variance"),
         (lambda: bmc.OrderedLogistic(0, 1.0), ShapeError, r"shape \(..., K\); got \(\)"),
@@ -108,9 +109,7 @@ def ordinal(rows: int) -> bmc.BayesNet:
     net.input("x", plates="row")
     net.add("slope", bmc.Normal(0.0, 1.0))
     net.add("cut", bmc.Ordered(bmc.Normal(0.0, 1.5), 2))
-    net.add(
-        "y", lambda slope, cut, x: bmc.OrderedLogistic(slope * x, cut), plates="row"
-    )  # fmt: skip
+    net.add("y", lambda slope, cut, x: bmc.OrderedLogistic(slope * x, cut), plates="row")
     return net
 
 
@@ -138,7 +137,7 @@ def exact() -> dict[str, np.ndarray]:
 ENGINES = [
     bmc.HamiltonianMonteCarlo(ess=2000),
     bmc.Gibbs(ess=2000),
-    bmc.MetropolisHastings(2_000),
+    bmc.MetropolisHastings(1_000),
     bmc.LikelihoodWeighting(200_000),
 ]  # fmt: skip
 
@@ -157,3 +156,87 @@ def test_engines_find_the_posterior(engine: Any) -> None:
     ).max() > 3.6  # a bias would be seen
     sds = np.array([post.std("slope"), *post.std("cut")])
     np.testing.assert_allclose(sds, wanted["sd"], rtol=0.1)
+
+
+# ---- inside of others --------------------------------------------------------------------------------
+
+
+def one(make: Any, read: Any, scale: float = 1.0) -> bmc.BayesNet:
+    net = bmc.BayesNet()
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("x", make)
+    net.add("y", lambda x: bmc.Normal(read(x), scale))
+    return net
+
+
+def first(x: Any) -> Any:
+    return x[..., 0]
+
+
+INSIDE = {
+    "hidden parameters": lambda m: bmc.Ordered(bmc.Normal(m, 1.0), 2),
+    "bounds of parts": lambda: bmc.Mixture(
+        [0.3, 0.7], [bmc.Ordered(bmc.Exponential(1.0), 2), bmc.Ordered(bmc.Normal(-1.0, 1.0), 2)]
+    ),
+    "a batch of parts": lambda m: bmc.Mixture(
+        [0.3, 0.7], bmc.Ordered(bmc.Normal(bmc.stack([m, m + 2]), 1.0), 2)
+    ),
+    "beside others": lambda: bmc.Joint(bmc.Ordered(bmc.Normal(0.0, 1.0), 2), bmc.Exponential(1.0)),
+}
+
+
+@pytest.mark.parametrize("name", INSIDE)
+@pytest.mark.parametrize(
+    "engine", [bmc.HamiltonianMonteCarlo(1500, 500), bmc.Gibbs(1500, 500)], ids=["H", "G"]
+)
+def test_inside_of_others(name: str, engine: Any) -> None:
+    # false-alarm rate 1e-3 for all components together, against weighted draws of the prior
+    net = one(INSIDE[name], first)
+    wanted = bmc.infer(net, {"y": 0.3}, engine=bmc.LikelihoodWeighting(100_000), rng=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # 1500 draws of four chains: too few for some
+        post = bmc.infer(net, {"y": 0.3}, engine=engine, rng=2)
+    off = np.abs(post.mean("x") - wanted.mean("x"))
+    error = np.hypot(post.mcse("x"), wanted.mcse("x"))
+    assert (off / error).max() < stats.norm.isf(5e-4 / off.size), off / error
+    assert error.max() < 0.15
+
+
+def test_what_would_leave_the_order_is_refused() -> None:
+    ordered = bmc.Ordered(bmc.Exponential(1.0), 2)
+    with pytest.raises(UnsupportedError, match="move the base of Ordered"):
+        bmc.Affine(ordered, -5.0, 2.0)
+    net = bmc.BayesNet()
+    net.add("top", bmc.Gamma(4.0, 1.0))
+    with pytest.raises(BayesmcError, match="bounds of its base differ within a batch"):
+        net.node(vectorize=True, name="t")(lambda top: bmc.Ordered(bmc.Uniform(0.0, top), 2))
+        net.add("y", lambda t: bmc.Normal(t[..., 1] - t[..., 0], 0.3))
+        bmc.infer(net, {"y": 1.0}, rng=0)
+
+
+def test_cutpoints_as_a_list() -> None:
+    net = bmc.BayesNet()
+    net.add("b", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda b: bmc.OrderedLogistic(b, [-1.0, 1.0]))
+    assert bmc.log_density(net, {"y": 2})(np.array([0.5]))[0] == pytest.approx(
+        float(bmc.OrderedLogistic(0.5, [-1.0, 1.0]).log_prob(2) + stats.norm.logpdf(0.5))
+    )
+
+
+@pytest.mark.parametrize(
+    "base",
+    [
+        bmc.Truncated(bmc.Normal(0.0, 1.0), 0.0, np.inf),
+        bmc.Mixture([0.3, 0.7], bmc.Normal([0.0, 3.0], 1.0)),
+    ],
+)
+def test_moments_are_numbers_or_refused(base: Any) -> None:
+    ordered = bmc.Ordered(base, 2)
+    try:
+        mean = ordered.mean
+    except UnsupportedError as error:
+        assert "no quantiles" in str(error)
+    else:
+        draws = ordered.sample(0, 40_000)  # within five standard errors
+        errors = draws.std(axis=0) / 200
+        assert (np.abs(draws.mean(axis=0) - mean) < 5 * errors).all()

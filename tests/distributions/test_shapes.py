@@ -61,6 +61,7 @@ COLUMNS = {
     "Affine": d.Affine(d.Gamma(2.0, 1.0), COLUMN, -2.0),
     "Joint": d.Joint(d.Normal(COLUMN, 1.0), d.Gamma(COLUMN, 1.0)),
     "InverseCdf": d.InverseCdf(d.Density(lambda x: -np.abs(x) - 0 * COLUMN)),
+    "BetaBinomial": d.BetaBinomial(7, COLUMN, 2.0),
     "LKJ": d.LKJ(3, COLUMN),
     "Ordered": d.Ordered(d.Normal(COLUMN, 1.0), 3),
     "OrderedLogistic": d.OrderedLogistic(COLUMN, [-1.0, 0.0, 2.0]),
@@ -165,7 +166,7 @@ def test_finite_tables_sum_to_one_and_equal_log_prob() -> None:
         np.testing.assert_allclose(table.sum(axis=-1), 1.0, rtol=1e-12)
         for k, value in enumerate(dist.support.values):
             np.testing.assert_allclose(table[..., k], np.exp(dist.log_prob(value)), rtol=1e-12)
-    assert tables == 8
+    assert tables == 9
 
 
 def test_bounds_that_depend_on_the_batch_have_no_common_size() -> None:

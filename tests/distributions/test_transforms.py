@@ -86,6 +86,7 @@ EXAMPLES: dict[str, tuple[Make, ...]] = {
     ),
     "Bernoulli": (lambda: d.Bernoulli(0.3),),
     "Beta": (lambda: d.Beta(2.0, 3.0), lambda: d.Beta([[0.7], [4.0]], [1.0, 2.0, 3.0])),
+    "BetaBinomial": (lambda: d.BetaBinomial(5, 2.0, 3.0),),
     "Binomial": (lambda: d.Binomial(5, 0.3),),
     "Categorical": (lambda: d.Categorical([0.2, 0.8]),),
     "Cauchy": (lambda: d.Cauchy(1.0, 2.0), lambda: d.Cauchy([0.0, 1.0], 1.0)),

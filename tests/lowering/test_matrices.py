@@ -10,7 +10,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression, Program, TracedArray, leaf
-from bayesmc.lowering import compiled, held_against_numpy, machine, matrices
+from bayesmc.lowering import compiled, held_against_numpy, kernel, machine, matrices
 from bayesmc.network import pose
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.guarded import guarded
@@ -77,11 +77,11 @@ def test_large_matrices_are_left_to_lapack() -> None:
 # ---- rounding ---------------------------------------------------------------------------------------
 
 
-def nearly_singular(rows: int) -> list[Expression]:
+def nearly_singular(rows: int, added: float = 1e-9) -> list[Expression]:
     """The log density of a Gaussian process with a smooth kernel, and its gradient."""
     x, y = np.linspace(0, 1, rows), np.sin(np.arange(rows))
     width = TracedArray(leaf("w", ()))
-    cov = np.exp(-0.5 * np.square((x[:, None] - x) / width)) + 1e-9 * np.eye(rows)
+    cov = np.exp(-0.5 * np.square((x[:, None] - x) / width)) + added * np.eye(rows)
     root = np.linalg.cholesky(cov)
     z = np.matvec(np.linalg.inv(root), y)
     total = -0.5 * np.sum(z * z) - np.sum(np.log(np.linalg.diagonal(root)))
@@ -107,6 +107,33 @@ def test_a_wrong_one_differs_by_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(matrices._FUNCTIONS, "forward", wrong)
     with pytest.raises(TraceError, match="and NumPy"):
         held_against_numpy(roots, WIDTHS, disturbed=disturbed(roots))
+
+
+def test_a_wrong_one_is_seen_where_rounding_decides_whether_there_is_a_factor(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    roots, made = nearly_singular(30, 1e-15), matrices._FUNCTIONS["forward"]
+    machine.loaded.cache_clear()
+    wrong = lambda module: made(module).replace("fsub double", "fadd double")  # noqa: E731
+    monkeypatch.setitem(matrices._FUNCTIONS, "forward", wrong)
+    with pytest.raises(TraceError, match="and NumPy"):
+        held_against_numpy(roots, WIDTHS, disturbed=disturbed(roots))
+
+
+def test_determinants_overflow_no_sooner_than_they_are_large() -> None:
+    root = guarded([np.linalg.det(TracedArray(leaf("a", (4, 4)))).expression])
+    sizes = np.array([[1e200, 1e200, 1e-200, 1e-200], [1e-200, -1e-200, 1e200, 1e200]])
+    found = compiled(root)({"a": sizes[:, :, None] * np.eye(4)})[0]
+    np.testing.assert_allclose(found, [1.0, -1.0], rtol=1e-12)
+
+
+def test_many_matrices_share_their_memory() -> None:
+    a = TracedArray(leaf("a", (40, 40)))
+    total = sum(np.linalg.inv(a + k)[0, 0] for k in range(40))
+    run, text = compiled([total.expression]), kernel.Kernel([total.expression], frozenset("a")).text
+    assert text.count(f"alloca double, i64 {40 * 40}") == 2  # of 40 inverses
+    value = {"a": np.eye(40)[None] * 3.0}
+    np.testing.assert_allclose(run(value), run.program(value), rtol=1e-9)
 
 
 def test_nothing_is_disturbed_without_matrices() -> None:

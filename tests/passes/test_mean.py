@@ -32,6 +32,7 @@ FAMILIES: dict[type, Callable[[Any], Any]] = {
     bmc.Exponential: lambda x: bmc.Exponential(x),
     bmc.Poisson: lambda x: bmc.Poisson(np.exp(x)),
     bmc.Binomial: lambda x: bmc.Binomial(7, 1 / (1 + x)),
+    bmc.BetaBinomial: lambda x: bmc.BetaBinomial(7, x, 2.0 + x**2),
     bmc.Geometric: lambda x: bmc.Geometric(1 / (1 + x)),
     bmc.NegativeBinomial: lambda x: bmc.NegativeBinomial(2.0 + x, logits=-x),
 }

@@ -334,6 +334,13 @@ _FAMILIES: dict[str, _Family] = {
     "OrderedLogistic": _Family(
         lambda p: f"bmc.OrderedLogistic({p.real()}, {_cutpoints(p)})", 0, True
     ),
+    "BetaBinomial": _Family(
+        lambda p: (
+            f"bmc.BetaBinomial({p.count()}, {p.positive((), -1, 2)}, {p.positive((), -1, 2)})"
+        ),
+        0,
+        True,
+    ),
     "LKJ": _Family(
         lambda p: f"bmc.LKJ({p.choices.integer(1, 3)}, {p.positive(low=-1, high=3)})", 2
     ),
