@@ -163,9 +163,10 @@ def log_density(
 
     What ``blackjax``, ``nutpie`` or ``scipy.optimize`` take: hidden continuous nodes become free numbers
     (logarithms of positive ones, log odds of shares, stick breaking of simplices, log-Cholesky factors of
-    covariances, partial correlations, steps of numbers in order), with the change of volume in the density. Hidden finite nodes are summed out: labels of a
-    plate element by element, others by their joint states, at most 512. Of continuous nodes those count, too,
-    on which nothing observed depends, but not elements of data that are missing and that nothing hangs on.
+    covariances, partial correlations, steps of numbers in order), with the change of volume in the density.
+    Hidden finite nodes are summed out: labels of a plate element by element, others by their joint states, at
+    most 512. Of continuous nodes those count, too, on which nothing observed depends, but not elements of
+    data that are missing and that nothing hangs on.
 
     Parameters
     ----------
