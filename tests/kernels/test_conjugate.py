@@ -605,7 +605,7 @@ def _words(prior: Any, child: Callable[..., Any], data: Any, plates: Any = "i") 
 @pytest.mark.parametrize(
     ("prior", "child", "data", "words"),
     [
-        (bmc.StudentT(3.0), lambda x: bmc.Normal(x, 1.0), Z, "a StudentT prior"),
+        (bmc.StudentT(3.0), lambda x: bmc.Normal(x, 1.0), Z, "the prior, StudentT, has no conjugate pair"),
         (bmc.Normal(), lambda x: bmc.StudentT(3.0, x, 1.0), Z, "StudentT, which makes no conjugate"),
         (bmc.Normal(), lambda x: bmc.Normal(np.exp(x), 1.0), Z, "affine in it (after np.exp)"),
         (bmc.Normal(), lambda x: bmc.Normal(np.abs(x), 1.0), Z, "affine in it (after np.absolute)"),
