@@ -8,7 +8,6 @@ log probability the broadcast of the value's and the distribution's batch. A fam
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -411,17 +410,6 @@ def as_quantile(q: Any) -> np.ndarray:
     """Probabilities as floats, NaN where they are none."""
     q = np.asarray(q, dtype=float)
     return np.where((q >= 0) & (q <= 1), q, np.nan)
-
-
-def as_size(family: str, size: Any) -> int:
-    """How many components or rows: a positive whole number."""
-    try:
-        found = operator.index(np.asarray(size)[()])
-    except TypeError:
-        raise ParameterError(f"{family}: size must be a whole number; got {size!r}") from None
-    if found < 1:
-        raise ParameterError(f"{family}: size must be at least 1; got {size!r}")
-    return found
 
 
 def as_whole(value: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 from bayesmc.distributions.base import Distribution, as_float, as_quantile, as_whole
 from bayesmc.distributions.support import Support, integers
@@ -100,4 +100,6 @@ class BetaBinomial(Distribution):
 
     @property
     def _scipy(self) -> Any:
+        from scipy import stats
+
         return stats.betabinom(self.total_count, self.concentration1, self.concentration0)

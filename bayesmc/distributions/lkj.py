@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from bayesmc.distributions.base import Distribution, as_float, as_size
+from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.parameters import as_size
 from bayesmc.distributions.support import Support, correlation
 from bayesmc.errors import ShapeError
 from bayesmc.gaussian import try_cholesky

@@ -9,7 +9,8 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions.adapt import as_distribution
-from bayesmc.distributions.base import Distribution, as_float, as_size
+from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.parameters import as_size
 from bayesmc.distributions.support import Support, increasing, integers
 from bayesmc.distributions.tails import tails_of
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError

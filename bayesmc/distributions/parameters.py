@@ -6,6 +6,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import operator
 from collections.abc import Callable, Iterable, KeysView, Mapping
 from typing import Any, NoReturn, TypeVar
 
@@ -199,3 +200,14 @@ def _looks_like(value: Any, named: list[str]) -> str:
     elif isinstance(value, str) or (isinstance(value, (list, tuple)) and _holds_text(value)):
         looks = "learn"  # names
     return looks if looks in named else named[0]
+
+
+def as_size(family: str, size: Any) -> int:
+    """How many components or rows: a positive whole number."""
+    try:
+        found = operator.index(np.asarray(size)[()])
+    except TypeError:
+        raise ParameterError(f"{family}: size must be a whole number; got {size!r}") from None
+    if found < 1:
+        raise ParameterError(f"{family}: size must be at least 1; got {size!r}")
+    return found

@@ -15,7 +15,6 @@ import numpy as np
 from bayesmc.errors import DensityError, EngineWarning, TraceError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.centring import Centring
-from bayesmc.kernels.compiled_transition import CompiledTransition
 from bayesmc.kernels.hamiltonian_warmup import (
     Bends,
     Metric,
@@ -26,12 +25,12 @@ from bayesmc.kernels.hamiltonian_warmup import (
     windows,
 )
 from bayesmc.kernels.lost_chains import LostChains
+from bayesmc.kernels.moving_density import MovingDensity
 from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, Transition, transition
 from bayesmc.structure.centring import Effects
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.target import Values
-from bayesmc.structure.unconstrained import unconstrained_density
 
 #: gradients that a trajectory takes at least, on the whole
 GRADIENTS = 8
@@ -129,13 +128,11 @@ class Hamiltonian(Kernel):
         compiled: bool | None = None,
         debug: bool = False,
     ) -> None:
-        self.density = density
         self.names = density.names
         self.given = given
         self.max_depth = max_depth
         self.match = match
         self.threads, self.compiled, self.debug = threads, compiled, debug
-        self._compiled: CompiledTransition | None = None
         self.step_size = StepSize(target_accept)
         #: a warmup whose length is said learns for the acceptance that is said
         self.bends = Bends() if warmup is None else None
@@ -146,14 +143,17 @@ class Hamiltonian(Kernel):
         self._effects: Effects | None = None
         if reparametrize and isinstance(density, UnconstrainedDensity):
             self._effects = Effects(density)
-        self._declared, self._run = density, (0, 1)
-        self._shares = np.ones(density.size)
+        self._moving = MovingDensity(density, threads, debug)
         self.ends, self.beginning = windows(warmup)
+
+    @property
+    def density(self) -> Density:
+        """The one that is followed: effects may be moved apart from their scale."""
+        return self._moving.density
 
     def expect(self, steps: int, chains: int) -> None:
         """Gradients are machine code where so many steps pay for it."""
-        self._run = steps, chains
-        self._use(self.density)
+        self._moving.expect(self._calls(steps), chains)
 
     def told(self, steps: int, chains: int) -> str:
         if not isinstance(self.density, UnconstrainedDensity):
@@ -161,7 +161,7 @@ class Hamiltonian(Kernel):
         return in_machine_code(self.density, self._calls(steps), chains).told
 
     def start(self, values: Values, chains: int) -> Memory:
-        self._centred(np.ones(self.density.size))
+        self._moving.centre(np.ones(self.density.size))
         u = self.density.unconstrain(values)
         log, slope = self._gradient(values)(u, np.arange(chains))
         if not (log > -np.inf).all():
@@ -174,10 +174,10 @@ class Hamiltonian(Kernel):
             "values": {n: values[n] for n in self.density.names},
             "metric": self.metric.start(slope),
             "lost": self.lost.start(*u.shape),
-            "shares": self._shares,
+            "shares": self._moving.shares,
             "effects": self._new_effects(),
             "step": self.step_size.start(np.zeros(chains)),
-            "machine": self._compiled is not None,
+            "machine": self._moving.compiled is not None,
             "sweep": 0,
             "windows": 0,
             "bends": np.zeros(2),
@@ -195,7 +195,7 @@ class Hamiltonian(Kernel):
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
-        self._centred(memory["shares"])
+        self._moving.centre(memory["shares"])
         gradient = self._gradient(values)
         place = self._place(values, memory, gradient)
         if warmup and memory["sweep"] == 0:
@@ -273,9 +273,9 @@ class Hamiltonian(Kernel):
         Which of both a run began with, and has come to, is part of its memory: so a resumed run draws the
         same numbers.
         """
-        if self._compiled is not None and memory["machine"]:
+        if self._moving.compiled is not None and memory["machine"]:
             try:
-                return self._compiled(gradient, place, step, scale, rng, depth, values)
+                return self._moving.compiled(gradient, place, step, scale, rng, depth, values)
             except TraceError as error:
                 if self.debug:
                     raise
@@ -360,14 +360,14 @@ class Hamiltonian(Kernel):
         if (shares == memory["shares"]).all():
             return place, memory
         try:
-            self._centred(shares)
+            self._moving.centre(shares)
         except UnsupportedError:
-            self._centred(memory["shares"])
+            self._moving.centre(memory["shares"])
             return place, memory
         u = self.density.unconstrain({**values, **memory["values"]})
         moved = Place(u, *self._gradient(values)(u, np.arange(len(u))))
         if not all(np.isfinite(part).all() for part in moved):
-            self._centred(memory["shares"])
+            self._moving.centre(memory["shares"])
             return place, memory
         step = {**memory["step"], "target": self.step_size.target}
         metric = self.metric.start(moved.slope)
@@ -376,27 +376,6 @@ class Hamiltonian(Kernel):
 
     def _new_effects(self) -> dict[str, Any]:
         return self.centring.start(0 if self._effects is None else self._effects.at.size)
-
-    def _use(self, density: Density) -> None:
-        """Move along a density, in machine code where the run is long enough."""
-        self.density, self._compiled = density, None
-        if isinstance(density, UnconstrainedDensity) and self._run[0]:
-            made = in_machine_code(density, self._calls(self._run[0]), self._run[1], self.debug)
-            self.density = made
-            if made.trajectories is not None:
-                self._compiled = CompiledTransition(made.trajectories, made, self.threads)
-
-    def _centred(self, shares: np.ndarray) -> None:
-        """Move effects with these shares of centring; which, is part of the memory."""
-        if np.array_equal(shares, self._shares):
-            return
-        declared, density = self._declared, self._declared
-        if isinstance(declared, UnconstrainedDensity) and (shares != 1.0).any():
-            density = unconstrained_density(
-                declared.target, declared.names, declared.summed, shares
-            )
-        self._use(density)
-        self._shares = shares
 
     def _found_again(
         self, place: Place, memory: Memory, lost: np.ndarray, rng: np.random.Generator

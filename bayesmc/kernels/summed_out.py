@@ -56,6 +56,6 @@ class SummedOut(Hamiltonian):
         u = memory["place"]["u"]
         read = {**values, **new}
         if self.apart(memory):  # states are drawn given the numbers as they are declared
-            u = self._declared.unconstrain(read)
+            u = self._moving.declared.unconstrain(read)
         states, _ = self._states(u, rng, None, read)
         return {**new, **states}, memory

@@ -124,13 +124,13 @@ class _Doubt(NamedTuple):
     undecided: Any = False
 
 
-NO_DOUBT = _Doubt()
+_NO_DOUBT = _Doubt()
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _difference(found: np.ndarray, wanted: np.ndarray, doubt: _Doubt = NO_DOUBT) -> str | None:
+def _difference(found: np.ndarray, wanted: np.ndarray, doubt: _Doubt = _NO_DOUBT) -> str | None:
     if found.shape != wanted.shape:
         return f"has the shape {found.shape}, not {wanted.shape}"
     if wanted.dtype.kind != "f":

@@ -15,7 +15,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.errors import EngineWarning, TraceError
-from bayesmc.kernels import hamiltonian
+from bayesmc.kernels import moving_density
 from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.lowering import checked, writer
 from bayesmc.lowering.no_u_turn import transitions
@@ -39,14 +39,14 @@ def schools() -> bmc.BayesNet:
 
 def run(monkeypatch: pytest.MonkeyPatch, **options: Any) -> tuple[Any, list[CompiledDensity]]:
     made: list[CompiledDensity] = []
-    real = hamiltonian.in_machine_code
+    real = moving_density.in_machine_code
 
     def noted(*args: Any) -> CompiledDensity:
         made.append(real(*args))
         return made[-1]
 
     with monkeypatch.context() as patch:
-        patch.setattr(hamiltonian, "in_machine_code", noted)
+        patch.setattr(moving_density, "in_machine_code", noted)
         engine = bmc.HamiltonianMonteCarlo(**{"draws": 1000, "warmup": 400, "chains": 4, **options})
         return bmc.infer(schools(), EVIDENCE, engine=engine, rng=0), made
 
@@ -119,7 +119,7 @@ def machine_code_of(net: bmc.BayesNet, evidence: Any, engine: Any) -> list[Hamil
     kernels = [k for k in engine.sampler(problem).kernels if isinstance(k, Hamiltonian)]
     for kernel in kernels:
         kernel.expect(100, 4)
-        assert kernel._compiled is not None
+        assert kernel._moving.compiled is not None
     return kernels
 
 
