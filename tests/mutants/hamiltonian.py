@@ -49,8 +49,8 @@ def trajectories(
         transitions.cache_clear()  # the text is written anew, with the fault
         if compiled:
             kernel.expect(10**6, 2000)
-            assert kernel._compiled is not None
-            kernel._compiled.is_checked = True  # who compares would see most faults first
+            assert kernel._moving.compiled is not None
+            kernel._moving.compiled.is_checked = True  # who compares would see most faults first
         transitions.cache_clear()
 
         def prior(rng: np.random.Generator, rows: int) -> dict[str, np.ndarray]:
