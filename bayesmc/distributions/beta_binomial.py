@@ -8,6 +8,7 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions.base import Distribution, as_float, as_quantile, as_whole
+from bayesmc.distributions.discrete import trials_of
 from bayesmc.distributions.support import Support, integers
 from bayesmc.shapes import Shape
 
@@ -52,12 +53,7 @@ class BetaBinomial(Distribution):
         self._set_batch(count.shape, one.shape, zero.shape)
         self.concentration1 = self._positive("concentration1", one)
         self.concentration0 = self._positive("concentration0", zero)
-        ok = whole & (count >= 0)
-        if not ok.all():
-            shown = np.asarray(total_count)
-            self._check("total_count", shown, ok, 0, "a nonnegative whole number")
-            count = np.where(ok, count, 0)
-        self.total_count = count
+        self.total_count = trials_of(self, total_count, count, whole)
 
     @staticmethod
     def log_density(x: Any, total_count: Any, concentration1: Any, concentration0: Any) -> Any:

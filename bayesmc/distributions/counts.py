@@ -14,7 +14,7 @@ from scipy import special
 from bayesmc.distributions.base import Distribution, as_float, as_quantile, as_whole
 from bayesmc.distributions.categorical import Categorical
 from bayesmc.distributions.deviance import by_size, deviance, stirling_rest
-from bayesmc.distributions.discrete import _Odds, whole_ppf
+from bayesmc.distributions.discrete import _Odds, trials_of, whole_ppf
 from bayesmc.distributions.support import Support, integers
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.shapes import Shape
@@ -291,12 +291,7 @@ class Multinomial(Distribution):
         self.event_shape = self.probs.shape[-1:]
         self._set_batch(count.shape, self._choice.batch_shape)
         self._adopt(self._choice)
-        ok = whole & (count >= 0)
-        if not ok.all():
-            shown = np.asarray(total_count)
-            self._check("total_count", shown, ok, 0, "a nonnegative whole number")
-            count = np.where(ok, count, 0)
-        self.total_count = count
+        self.total_count = trials_of(self, total_count, count, whole)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         probs = self.probs

@@ -153,12 +153,7 @@ class Binomial(_Odds):
     def __init__(self, total_count: Any, probs: Any = None, *, logits: Any = None) -> None:
         count, whole = as_whole(total_count)
         self._set_probs(probs, logits, count.shape)
-        ok = whole & (count >= 0)
-        if not ok.all():
-            shown = np.asarray(total_count)
-            self._check("total_count", shown, ok, 0, "a nonnegative whole number")
-            count = np.where(ok, count, 0)
-        self.total_count = count
+        self.total_count = trials_of(self, total_count, count, whole)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         return np.asarray(rng.binomial(self.total_count, self.probs, shape))
@@ -360,3 +355,12 @@ def whole_ppf(cdf: Callable[[np.ndarray], np.ndarray], q: Any, low: Any, high: A
         below = np.where(wide & ~reached, middle, below)
     answer = np.where(q == 1, high, np.where(q > 0, enough, low - 1.0))
     return np.where(np.isnan(q), np.nan, answer)
+
+
+def trials_of(dist: Distribution, given: Any, count: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """Numbers of trials; those that are none are marked or raised, and count as 0 (``as_whole``)."""
+    ok = whole & (count >= 0)
+    if ok.all():
+        return count
+    dist._check("total_count", np.asarray(given), ok, 0, "a nonnegative whole number")
+    return np.where(ok, count, 0)

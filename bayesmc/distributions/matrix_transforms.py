@@ -42,9 +42,7 @@ class LogCholesky(Transform):
         at[np.arange(d), np.arange(d)] = row.size + np.arange(d)
         factor = np.take(np.concatenate(parts, axis=-1), at, axis=-1)
         x = np.reshape(factor @ np.matrix_transpose(factor), (*lead, d * d))
-        here = np.arange(d * d).reshape(d, d)
-        lower = np.tril(here) + np.tril(here, -1).T
-        return np.take(x, lower, axis=-1)  # symmetric to the last bit
+        return np.take(x, _mirrored(d), axis=-1)
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
         d = self.event_shape[0]
@@ -90,8 +88,7 @@ class PartialCorrelations(Transform):
         at[np.tril_indices(d)] = np.arange(len(entries))
         factor = np.take(np.stack([*entries, 0.0 * one], axis=-1), at, axis=-1)
         x = np.reshape(factor @ np.matrix_transpose(factor), (*lead, d * d))
-        here = np.arange(d * d).reshape(d, d)
-        lower = np.tril(here) + np.tril(here, -1).T
+        lower = _mirrored(d)
         lower[np.arange(d), np.arange(d)] = d * d  # ones to the last bit
         return np.take(np.concatenate([x, one[..., None]], axis=-1), lower, axis=-1)
 
@@ -112,3 +109,9 @@ class PartialCorrelations(Transform):
     def _log_left(self, u: Any) -> Any:
         """``log(1 - tanh(u)^2)``."""
         return special.log_expit(2 * u) + special.log_expit(-2 * u) + math.log(4.0)
+
+
+def _mirrored(d: int) -> np.ndarray:
+    """Where the entries of a matrix lie in its lower triangle: symmetric to the last bit."""
+    here = np.arange(d * d).reshape(d, d)
+    return np.tril(here) + np.tril(here, -1).T
