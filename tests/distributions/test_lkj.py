@@ -127,6 +127,16 @@ def test_engines_find_the_posterior(engine: Any) -> None:
     np.testing.assert_allclose(post.std("R")[0, 1], sd, rtol=0.1)
 
 
+def test_messages_look_where_no_correlation_is() -> None:
+    # EP asks for the density of numbers that make no matrix, too: none there, and it says what it could not do
+    net = bmc.BayesNet()
+    net.add("level", bmc.Normal(0.0, 1.0))
+    net.add("R", bmc.LKJ(2, 2.0))
+    net.add("y", lambda level, R: bmc.MvNormal(level[..., None] * np.ones(2), R))  # noqa: N803
+    with pytest.warns(bmc.errors.ConvergenceWarning, match="take Gibbs"):
+        bmc.infer(net, {"y": [0.0, 0.5]}, engine=bmc.ExpectationPropagation())
+
+
 def test_a_concentration_that_is_hidden() -> None:
     # R observed: the posterior of c by a lattice; false-alarm rate 1e-3 for each engine
     net = bmc.BayesNet()

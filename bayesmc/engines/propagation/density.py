@@ -34,6 +34,7 @@ from bayesmc.network.model import potential_shape
 from bayesmc.passes.affine import Affine
 from bayesmc.passes.arithmetic import rewritten
 from bayesmc.passes.directions import breaks, directions
+from bayesmc.passes.guarded import guarded
 from bayesmc.passes.log_density import family_of, log_density
 from bayesmc.passes.reads import element_read
 from bayesmc.structure.tables import configure, reads_of
@@ -146,7 +147,8 @@ class Terms:
         zero = breaks(inner.residual, inner.names)
         if zero and within.shape[-1] > 1 and d > 1:
             raise TraceError("it jumps or bends in several directions")
-        program = Program([inner.residual, *(broadcast(z, _full(z, shape)) for z in zero)])
+        residual = guarded([inner.residual])
+        program = Program([*residual, *(broadcast(z, _full(z, shape)) for z in zero)])
         leaves = {n: f.offset.shape for n, f in zip(inner.names, inner.combinations, strict=True)}
         factors = Density(program, leaves, values, cards, shape, offset, within, at, len(zero))
         self._hold(name, factors, root, coordinates, weights, cards, shape, values)
