@@ -11,7 +11,7 @@ import numpy as np
 from bayesmc.auto.choosing import checked_engine, engine_for
 from bayesmc.auto.files import Opened
 from bayesmc.auto.several import Folder, is_several, seed_of, several
-from bayesmc.auto.switching import settled_or_kim
+from bayesmc.auto.switching import settled_or_kim, warn_where_merging_matters
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.frames import times_ahead
 from bayesmc.dbn.given import check_steps
@@ -123,7 +123,10 @@ def filter(
     with run.kept, picks_told(problem.slices, problem.series):
         # asked here: warnings name the line that called
         found = run.answer or run.engine.filter(problem, run.seed, **run.options)
-        return run.ended(problem, found)
+        found = run.ended(problem, found)
+    if engine is None:
+        warn_where_merging_matters("filter", found, problem)
+    return found
 
 
 @overload
@@ -252,7 +255,10 @@ def forecast(
     observations, inputs, _ = dbn.unframed(observations, inputs)
     chosen = engine_for(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
-    found = chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+    found = chosen.filter(problem, seed_sequence(rng), **options)
+    if engine is None:
+        warn_where_merging_matters("forecast", found, problem)
+    found = found.last(steps, "forecast")
     found.times = times
     found.paths = Paths(problem, observations, inputs)
     return found

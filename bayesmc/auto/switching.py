@@ -1,12 +1,15 @@
-"""Smoothing of switching systems where no engine is named: messages until they settle, or Kim's smoother.
+"""Switching systems where no engine is named: what merging does to filters, and who smooths.
 
-Kim's smoother goes back once and cannot tell where it is wrong; expectation propagation is nearer wherever
-its messages settle, and says where they do not. What it may cost is counted before it starts.
+Nobody knows what a filter with merged Gaussians is off by; that it would say something else if it had merged
+sooner shows that merging matters. Kim's smoother goes back once and cannot tell where it is wrong;
+expectation propagation is nearer wherever its messages settle, and says where they do not. What it may cost
+is counted before it starts.
 """
 
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +17,7 @@ from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.propagation.engine import ExpectationPropagation
 from bayesmc.engines.switching.filter import SwitchingKalmanFilter
-from bayesmc.errors import ConvergenceWarning, EngineWarning, UnsupportedError
+from bayesmc.errors import BayesmcError, ConvergenceWarning, EngineWarning, UnsupportedError
 from bayesmc.results import SeriesPosterior
 
 #: slices passed back and forth that are spent at most where nobody asked for it: some 50 s
@@ -23,6 +26,8 @@ _BUDGET = 100_000
 _FEWEST = 15
 #: what an undamped sweep may still change, of a belief in standard deviations, for it to be an answer
 _NEAR = 0.1
+#: differences that merging sooner makes, of the log evidence and of probabilities, of which nobody is told
+_SAME_EVIDENCE, _SAME_PROBABILITY = 0.3, 0.1
 #: why it is taken
 REASON = (
     "hidden numbers are linear-Gaussian given finite nodes; answers are approximate, and where messages do "
@@ -46,6 +51,43 @@ def why_too_long(engine: ExpectationPropagation, problem: SeriesProblem) -> str 
     return (
         f"ExpectationPropagation: {problem.steps} slices would take too long for a default (a sweep costs "
         "about as much as Kim's smoother, and most series need some 20); ask for it by name"
+    )
+
+
+def warn_where_merging_matters(call: str, found: SeriesPosterior, problem: SeriesProblem) -> None:
+    """Hold a filter whose Gaussians were merged against one that merges them sooner, by GPB1.
+
+    On 22 series whose log evidence is known, 20 of them random, that of GPB2 was off by less than the two
+    differed in each, .33 at most: by some thousandth of it mostly, and by half of it on two published ones.
+
+    Warns
+    -----
+    EngineWarning
+    """
+    engine = found.engine
+    if not isinstance(engine, SwitchingKalmanFilter) or getattr(found, "interrupted", False):
+        return
+    sooner = replace(engine, merging="gpb1")
+    try:
+        rough = sooner.filter(problem, np.random.SeedSequence(0), progress=False)
+    except BayesmcError:  # it merges what does not go together: there is nothing to compare
+        return
+    logs = (np.sum(f.log_marginal_increments, axis=0) for f in (found, rough))
+    evidence = float(np.max(np.abs(np.subtract(*logs))))
+    finite = [n for n in found.names if problem.slices.first[n].domain is not None]
+    off = (found.probabilities(n) - rough.probabilities(n) for n in finite)
+    probability = max((float(np.max(np.abs(d), initial=0.0)) for d in off), default=0.0)
+    if evidence <= _SAME_EVIDENCE and probability <= _SAME_PROBABILITY:
+        return
+    warnings.warn(
+        f"{call}: SwitchingKalmanFilter answers, which merges Gaussians: what it says is approximate, and "
+        f"merged sooner (merging='gpb1') they tell a log evidence that differs by {evidence:.2g} and "
+        f"probabilities that differ by up to {probability:.2g}. Its own error is mostly far below that, but "
+        "nobody knows it: hold it against engine=bmc.ParticleFilter(marginalize='auto', "
+        "proposal='optimal'), which states one; if it is what you want, name it, "
+        "engine=bmc.SwitchingKalmanFilter()",
+        EngineWarning,
+        stacklevel=3,
     )
 
 
