@@ -128,12 +128,12 @@ def test_engines_find_the_posterior(engine: Any) -> None:
 
 
 def test_messages_look_where_no_correlation_is() -> None:
-    # EP asks for the density of numbers that make no matrix, too: none there, and it says what it could not do
+    # EP asks for the density of numbers that make no matrix, too, and says that its answer is rough
     net = bmc.BayesNet()
     net.add("level", bmc.Normal(0.0, 1.0))
     net.add("R", bmc.LKJ(2, 2.0))
     net.add("y", lambda level, R: bmc.MvNormal(level[..., None] * np.ones(2), R))  # noqa: N803
-    with pytest.warns(bmc.errors.ConvergenceWarning, match="take Gibbs"):
+    with pytest.warns(bmc.errors.ConvergenceWarning, match="Gibbs"):
         bmc.infer(net, {"y": [0.0, 0.5]}, engine=bmc.ExpectationPropagation())
 
 
