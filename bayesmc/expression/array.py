@@ -143,7 +143,9 @@ class TracedArray(NDArrayOperatorsMixin):
         if func is np.isin and isinstance(args[0], TracedStates):
             return args[0].isin(np.ravel(np.asarray(args[1], dtype=object)).tolist(), **kwargs)
         if func in COMPOSED or func in COMPOSED_OF_SEVERAL:
-            return _composed(func, args, kwargs)
+            found = _composed(func, args, kwargs)
+            if found is not NotImplemented:
+                return found
         result = _noted(of_function, func, args, kwargs)
         return _labelled(func, args, every, result)
 
@@ -189,7 +191,8 @@ class TracedArray(NDArrayOperatorsMixin):
 
     flatten = ravel
 
-    sum, mean, prod, cumsum = (_method(f) for f in (np.sum, np.mean, np.prod, np.cumsum))
+    sum, mean, prod = (_method(f) for f in (np.sum, np.mean, np.prod))
+    cumsum, cumprod = (_method(f) for f in (np.cumsum, np.cumprod))
     std, var, max, min = (_method(f) for f in (np.std, np.var, np.max, np.min))
     any, all, clip, round = (_method(f) for f in (np.any, np.all, np.clip, np.round))
     dot, take, repeat = (_method(f) for f in (np.dot, np.take, np.repeat))

@@ -1,4 +1,7 @@
-"""Functions of NumPy and SciPy that are said in terms of others: they work on arrays and stand-ins alike."""
+"""Functions of NumPy and SciPy that are said in terms of others: they work on arrays and stand-ins alike.
+
+What cannot be said so of some arguments is ``NotImplemented``.
+"""
 
 from __future__ import annotations
 
@@ -124,10 +127,60 @@ def _sinc(x: Any) -> Any:
     return np.where(node == 0.0, 1.0, np.sin(node) / node)
 
 
+def _cumprod(a: Any, axis: Any = None) -> Any:
+    """By doubling: after each round entries are products of twice as many."""
+    if axis is None:
+        a, axis = np.reshape(a, (-1,)), 0
+    size, width = a.shape[axis], 1
+    one = tuple(1 if k == axis % a.ndim else n for k, n in enumerate(a.shape))
+    while width < size:
+        ones = np.repeat(np.ones(one, a.dtype), width, axis=axis)
+        a = a * np.concatenate([ones, np.take(a, np.arange(size - width), axis=axis)], axis=axis)
+        width *= 2
+    return a
+
+
+def _known(a: Any) -> Any:
+    """The numbers of an argument; None where it stands for others."""
+    node = getattr(a, "expression", None)
+    return a if node is None else getattr(node, "value", None)
+
+
+def _looked_up(table: np.ndarray, at: Any) -> Any:
+    return np.reshape(np.take_along_axis(table, np.reshape(at, (-1,)), axis=0), at.shape)
+
+
+def _interp(
+    x: Any, xp: Any, fp: Any, left: Any = None, right: Any = None, period: Any = None
+) -> Any:
+    """By bisection among known knots; others are left to NumPy."""
+    knots, heights = map(_known, (xp, fp))
+    if knots is None or heights is None:
+        return NotImplemented
+    xs, ys = np.asarray(knots, dtype=float), np.asarray(heights, dtype=float)
+    if period is not None or xs.ndim != 1 or xs.shape != ys.shape or len(xs) < 2:
+        return NotImplemented
+    widths = np.diff(xs)
+    if not (np.isfinite(xs).all() and (widths > 0).all()):
+        return NotImplemented
+    inside = np.minimum(np.maximum(x, xs[0]), xs[-1])
+    rounds = int(np.ceil(np.log2(len(widths))))
+    starts = np.full(2**rounds, np.inf)
+    starts[: len(widths)] = xs[:-1]
+    at: Any = np.zeros(x.shape, dtype=np.intp)
+    for step in 2 ** np.arange(rounds)[::-1]:
+        at = np.where(inside >= _looked_up(starts, at + step), at + step, at)
+    slopes = np.diff(ys) / widths
+    found = _looked_up(ys, at) + _looked_up(slopes, at) * (inside - _looked_up(xs, at))
+    found = np.where(x < xs[0], ys[0] if left is None else left, found)
+    return np.where(x > xs[-1], ys[-1] if right is None else right, found)
+
+
 #: function -> the same in terms of others, whose first argument is an array or stands for one
 COMPOSED: Mapping[Any, Callable[..., Any]] = {
     np.mean: _mean, np.var: _var, np.average: _average, np.clip: _clip, np.isin: _isin,
-    np.diff: _diff, np.choose: _choose, np.diag: _diag, np.nan_to_num: _nan_to_num, np.sinc: _sinc,
+    np.diff: _diff, np.cumprod: _cumprod, np.interp: _interp,
+    np.choose: _choose, np.diag: _diag, np.nan_to_num: _nan_to_num, np.sinc: _sinc,
     np.std: lambda a, axis=None, **how: np.sqrt(_var(a, axis, **how)),
     np.ptp: lambda a, axis=None: np.max(a, axis=axis) - np.min(a, axis=axis),
     np.outer: lambda a, b: np.reshape(a, (-1, 1)) * np.reshape(b, (1, -1)),

@@ -19,6 +19,7 @@ from bayesmc.lowering.compiled import Compiled, Way, address_of
 from bayesmc.lowering.no_u_turn import FALLBACK, TOLD, numbers_of, transitions
 from bayesmc.lowering.ufuncs import kind_of
 from bayesmc.lowering.writer import DTYPES
+from bayesmc.shapes import Shape
 
 #: ``ask(chain, u)``: the log density of a chain at free numbers ``(size,)``, and its gradient
 Ask = Callable[[int, np.ndarray], tuple[Any, np.ndarray]]
@@ -67,13 +68,18 @@ class Trajectories:
     def __init__(self, run: Compiled | None, free: str) -> None:
         self._run = transitions()
         self._way = None if run is None else Way(run.roots, frozenset([free]))
-        self._others: list[tuple[int, Any, np.dtype]] = []
+        #: of other leaves: place, name, type, shape and bytes of a value
+        self._others: list[tuple[int, str, np.dtype, Shape, int]] = []
         if self._way is None:
             return
         leaves = list(enumerate(self._way.kernel.leaves))
         if not self._way.loaded.direct or not any(n.name == free for _, n in leaves):
             raise TraceError("the log density does not depend on its free numbers alone")
-        self._others = [(k, n, DTYPES[kind_of(n)]) for k, n in leaves if n.name != free]
+        for k, leaf in leaves:
+            if leaf.name != free:
+                dtype = DTYPES[kind_of(leaf)]
+                size = dtype.itemsize * math.prod(leaf.shape)
+                self._others.append((k, leaf.name, dtype, leaf.shape, size))
 
     def move(
         self,
@@ -138,12 +144,14 @@ class Trajectories:
         self, values: Mapping[str, np.ndarray], chains: int
     ) -> tuple[np.ndarray, list[np.ndarray]]:
         """Where each other leaf's value of every chain lies, and the memory behind it."""
-        moving, held = np.zeros((len(self._others) + 1, 3), np.int64), []
-        for row, (place, node, dtype) in zip(moving, self._others, strict=False):
-            array = np.ascontiguousarray(values[node.name], dtype)
-            held.append(np.ascontiguousarray(np.broadcast_to(array, (chains, *node.shape))))
-            row[:] = place, address_of(held[-1]), dtype.itemsize * math.prod(node.shape)
-        return moving, held
+        rows, held = [], []
+        for place, name, dtype, shape, size in self._others:
+            array = np.ascontiguousarray(values[name], dtype)
+            if array.shape != (chains, *shape):
+                array = np.ascontiguousarray(np.broadcast_to(array, (chains, *shape)))
+            held.append(array)
+            rows.append((place, address_of(array), size))
+        return np.array([*rows, (0, 0, 0)], np.int64), held
 
 
 def shared(part: Callable[[int, int], None], chains: int, threads: int) -> None:

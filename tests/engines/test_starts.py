@@ -177,7 +177,29 @@ def occupancy() -> tuple[bmc.BayesNet, dict[str, Any]]:
     return net, {"y": seen.astype(int)}
 
 
-MODELS = {f.__name__: f for f in (lifetimes, regression, far_off, ordinal, captures, occupancy)}
+def above_another() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """A rate whose density, which cannot be drawn from, is zero below that of the other component."""
+
+    def above(low: Any) -> Any:
+        return bmc.Density(
+            lambda x: np.where(x > low, -0.5 * (x - 3.0) ** 2, -np.inf), support="positive"
+        )
+
+    rng = np.random.default_rng(0)
+    net = bmc.BayesNet(plates={"row": 60})
+    net.add("slow", bmc.HalfNormal(1.0))
+    net.add("fast", above, parents=["slow"])
+    net.add("z", bmc.Categorical([0.5, 0.5]), plates="row")
+    net.add(
+        "u", lambda z, slow, fast: bmc.Exponential(np.where(z == 0, slow, fast)), plates="row"
+    )
+    return net, {"u": rng.exponential(np.where(np.arange(60) % 2 == 0, 1.0, 0.2))}
+
+
+MODELS = {
+    f.__name__: f
+    for f in (lifetimes, regression, far_off, ordinal, captures, occupancy, above_another)
+}
 
 
 @pytest.mark.parametrize("name", MODELS)

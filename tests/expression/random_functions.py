@@ -49,7 +49,8 @@ _BINARY: dict[str, Callable[[Any, Any], Any]] = {
 #: of vectors on the last axis
 _VECTOR: dict[str, Callable[[Any], Any]] = {
     "reverse": lambda x: x[..., ::-1], "sum": lambda x: x.sum(axis=-1, keepdims=True) + 0.0 * x,
-    "cumsum": lambda x: 0.5 * np.cumsum(x, axis=-1), "roll": lambda x: np.roll(x, 1, axis=-1),
+    "cumsum": lambda x: 0.5 * np.cumsum(x, axis=-1), "cumprod": lambda x: np.cumprod(np.tanh(x), axis=-1),
+    "roll": lambda x: np.roll(x, 1, axis=-1),
     "matvec": lambda x: np.matvec(SQUARE, x) / 4, "pick": lambda x: x[..., [2, 0, 0]],
     "stack": lambda x: bmc.stack([x[..., 0], x[..., 2], np.sin(x[..., 1])]),
     "softmax": lambda x: special.softmax(x, axis=-1),
@@ -58,7 +59,7 @@ _VECTOR: dict[str, Callable[[Any], Any]] = {
     "einsum": lambda x: np.einsum("...i,ij->...j", x, SQUARE) / 4,
     "concatenate": lambda x: np.concatenate([x[..., 1:], x[..., :1] ** 2 / (1 + x[..., :1] ** 2)], axis=-1),
     "solve": lambda x: np.linalg.solve(SQUARE, x[..., None])[..., 0],
-    "norm": lambda x: x / (1 + np.linalg.norm(x, axis=-1, keepdims=True)),
+    "norm": lambda x: x / (1 + np.linalg.norm(x + 0.1, axis=-1, keepdims=True)),
     "max": lambda x: x - 0.5 * np.max(x, axis=-1, keepdims=True), "sort": lambda x: np.sort(x, axis=-1),
     "filled": lambda x: _filled(x),
     "diff": lambda x: np.concatenate([x[..., :1], np.diff(x, axis=-1)], axis=-1),

@@ -312,7 +312,7 @@ def _attempt(
 
     And whether that is of known labels alone, where others are missing.
     """
-    values, undefined = _drawn_all(target, count, spread, rng, given)
+    values, undefined, elsewhere = _drawn_all(target, count, spread, rng, given)
     log, told = np.zeros(count), set[str]()
     for name in target.chain:
         if target.seen(name) is not None and name not in given:
@@ -328,6 +328,7 @@ def _attempt(
     inside = set(target.chain)
     for term in target.terms.values():
         is_drawn = term.name in inside and target.seen(term.name) is None and term.name not in given
+        is_drawn = is_drawn and term.name not in elsewhere
         if is_drawn and labels is None:
             continue
         part = row_logs(term, values, count)
@@ -344,19 +345,25 @@ def _attempt(
 
 def _drawn_all(
     target: Target, count: int, spread: float, rng: np.random.Generator, given: Values
-) -> tuple[Values, dict[str, np.ndarray]]:
+) -> tuple[Values, dict[str, np.ndarray], set[str]]:
     """Values of all nodes: forward draws of the chain's, and what follows from them.
 
-    With them, by node, the draws whose own parameters are out of range, shape ``(count,)``.
+    With them, by node, the draws whose own parameters are out of range, shape ``(count,)``; and nodes that
+    are not drawn from their own density, which may be zero there.
     """
     undefined: dict[str, np.ndarray] = {}
+    elsewhere: set[str] = set()
 
     def value(node: CompiledNode, values: Values) -> np.ndarray:
         if node.name in given:
             return given[node.name]
-        return _drawn(target, node, values, count, spread, rng, undefined)
+        drawn = _drawn(target, node, values, count, spread, rng, undefined)
+        if drawn is None:
+            elsewhere.add(node.name)
+            return _of_support(node, count, rng)
+        return drawn
 
-    return in_order(target, count, value), undefined
+    return in_order(target, count, value), undefined, elsewhere
 
 
 def _drawn(
@@ -367,11 +374,12 @@ def _drawn(
     spread: float,
     rng: np.random.Generator,
     undefined: dict[str, np.ndarray],
-) -> np.ndarray:
+) -> np.ndarray | None:
+    """Draws of one node; None where its density cannot be drawn from."""
     if node.name not in target.terms:
         log = _alone(target, node, values, count)
         if log is None:
-            return _of_support(node, count, rng)
+            return None
         assert node.domain is not None
         states = pick_log(log, rng.random(log.shape[1:]), f"node {node.name!r}")
         return states.astype(node.domain.dtype)
@@ -382,7 +390,7 @@ def _drawn(
     try:
         draws = target.model.sample_stored(node.name, dist, rng, (count,))
     except UnsupportedError:
-        return _of_support(node, count, rng)
+        return None
     if node.domain is not None or node.is_discrete:
         return draws
     return nearer(dist, draws, spread, (count, *node.value_shape), len(node.event_shape))
