@@ -96,5 +96,8 @@ def _by_infer(
         found = explained(net, observations, None, inputs)
     except UnsupportedError:
         raise refused from None
-    reasons = (f"this is what infer(dbn, observations) takes; {refused}", *found.reasons)
+    reasons = (
+        f"infer(dbn, observations) takes it, and over time no engine does: {refused}",
+        *found.reasons,
+    )
     return replace(found, reasons=reasons)

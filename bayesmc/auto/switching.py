@@ -72,7 +72,7 @@ def warn_where_merging_matters(call: str, found: SeriesPosterior, problem: Serie
         rough = sooner.filter(problem, np.random.SeedSequence(0), progress=False)
     except BayesmcError:  # it merges what does not go together: there is nothing to compare
         return
-    logs = (np.sum(f.log_marginal_increments, axis=0) for f in (found, rough))
+    logs = (np.sum(np.asarray(f.log_marginal_increments), axis=0) for f in (found, rough))
     evidence = float(np.max(np.abs(np.subtract(*logs))))
     finite = [n for n in found.names if problem.slices.first[n].domain is not None]
     off = (found.probabilities(n) - rough.probabilities(n) for n in finite)

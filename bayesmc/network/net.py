@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import DuplicateNodeError, EvidenceError, UnknownNodeError
+from bayesmc.errors import DuplicateNodeError, EvidenceError, ModelError, UnknownNodeError
 from bayesmc.network.declaring import (
     Declared,
     DeclaredPlates,
@@ -176,22 +176,45 @@ class BayesNet(Declared):
 
     def potential(
         self,
-        name: str,
-        function: Callable[..., Any],
+        name: str | Callable[..., Any] | None = None,
+        function: Callable[..., Any] | None = None,
         parents: Parents = None,
         plates: str | Sequence[str] = (),
-    ) -> None:
+    ) -> Any:
         """Add a log factor on named nodes: the joint density is multiplied by ``exp(function(...))``.
 
         Without ``plates`` the function sees plated nodes as foreign and reduces them (``x.sum("point")``);
-        with them it acts element by element and the elements are summed.
+        with them it acts element by element and the elements are summed. Without ``function`` it is a
+        decorator; the name is that of the function if none is given.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet()
+        >>> net.add("a", bmc.Uniform(0.0, 1.0))
+        >>> net.add("b", bmc.Uniform(0.0, 1.0))
+        >>> @net.potential
+        ... def order(a, b):
+        ...     return np.where(a < b, 0.0, -np.inf)
+        >>> net.potentials["order"].parents
+        ('a', 'b')
         """
+        if function is None and (name is None or callable(name)):
+            return decorating(name, None, self.potential, (parents, plates), {}, "potential")
+        if function is None:
+            return decorating(None, str(name), self.potential, (parents, plates), {}, "potential")
+        if not isinstance(name, str):
+            raise ModelError(
+                f"net.potential({name!r}, ...): the name comes first, then the function"
+            )
         within = self._plates.of(f"node {name!r}", plates)
         found = declared_potential(name, function, parents, within)
         if name in self._declarations or name in self._potentials:
             raise DuplicateNodeError(f"potential {name!r}: the name is declared already")
         self._potentials[name] = found
         self._changed()
+        return None
 
     def do(self, mapping: Mapping[str, Any] | None = None, /, **values: Any) -> BayesNet:
         """A new net with those nodes cut from their parents and fixed (Pearl's intervention).

@@ -186,18 +186,20 @@ def decorating(
     add: Callable[..., None],
     rest: tuple[Any, ...],
     options: Mapping[str, Any],
+    verb: str = "node",
 ) -> Any:
     """A decorator that declares a function by ``add``, or what that returns for one that is given."""
     if function is not None and not callable(function):
         raise ModelError(
-            f"net.node({function!r}): it decorates a function; give the node's name with name="
+            f"net.{verb}({function!r}): it decorates a function; give the node's name with name="
         )
 
     def declare(f: Callable[..., Any]) -> Callable[..., Any]:
         own = name if name is not None else getattr(f, "__name__", "<lambda>")
         if own == "<lambda>":
             raise ModelError(
-                "this function has no name to give the node (a lambda or partial); use name= or net.add"
+                f"this function has no name to give the {verb} (a lambda or partial); "
+                + ("use name= or net.add" if verb == "node" else "give the name before it")
             )
         add(own, f, *rest, **options)
         return f

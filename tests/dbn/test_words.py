@@ -208,7 +208,7 @@ def hidden_density() -> bmc.DynamicBayesNet:
 def test_explain_answers_where_infer_does(build: Any, question: str) -> None:
     """It says what infer takes, and once why no filter answers."""
     told = bmc.explain(build(), ROWS, question=question)
-    assert told.reasons[0].startswith("this is what infer(dbn, observations) takes")
+    assert told.reasons[0].startswith("infer(dbn, observations) takes it")
     assert isinstance(told.engine, (bmc.Gibbs, bmc.MetropolisHastings)) and set(told.nodes) >= {
         "x[0]",
         "y[2]",

@@ -544,6 +544,34 @@ def test_inputs():
     assert net.sample(4, rng=0, inputs=given)["y"].shape == (4, 3)
 
 
+def test_potentials_by_decorators():
+    net = bmc.BayesNet(plates={"row": 3})
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("b", bmc.Normal(0.0, 1.0), plates="row")
+
+    @net.potential
+    def order(a, b):
+        return np.where((a < b).all("row"), 0.0, -np.inf)
+
+    @net.potential("near")
+    def _(a):
+        return -(a**2)
+
+    @net.potential(plates="row")
+    def each(b):
+        return -(b**2)
+
+    assert net.potentials["order"].parents == ("a", "b") and order is not None
+    assert net.potentials["near"].parents == ("a",)
+    assert net.potentials["each"].plates == ("row",)
+    with pytest.raises(bmc.errors.ModelError, match="the name comes first"):
+        net.potential(order, "order")
+    with pytest.raises(bmc.errors.ModelError, match="no name to give the potential"):
+        net.potential(lambda a: -(a**2))
+    with pytest.raises(bmc.errors.DuplicateNodeError):
+        net.potential(each)
+
+
 def test_potentials_with_and_without_plates():
     net = bmc.BayesNet(plates={"p": 3})
     net.add("a", bmc.Normal(0.0, 1.0))

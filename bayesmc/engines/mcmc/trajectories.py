@@ -71,8 +71,9 @@ def faulty_trajectories(
         if ratio < _LEAST_RATIO:
             yield (
                 f"energies change slowly (E-BFMI {ratio:.2f}, under {_LEAST_RATIO}): heavy tails or a funnel "
-                f"are not explored; {_apart_from(kernel, memory, kernels)}declare heavy tails as a scale "
-                "mixture, or give tighter priors"
+                f"are explored slowly, if at all; {_apart_from(kernel, memory, kernels)}declare heavy tails "
+                "as a scale mixture, what a potential ties to its scale as scale * z with the potential on "
+                "z, or give tighter priors"
             )
 
 
