@@ -172,7 +172,7 @@ def smooth(
         How it draws them: by rejection where the transition's height is known (the same law); what is still
         open, and elsewhere all, among 500 particles of the slice drawn by weight and the filter's own
         ancestor. So time is that of the filter, and at most some 500 densities per trajectory and slice (as
-        many times as lags reach back). With ``marginalize=`` 32 and the ancestor, without rejection.
+        many times as lags reach back). With ``marginalize=`` 96 and the ancestor, without rejection.
         ``"exact"`` tries all particles for each.
 
     checkpoint : path or CheckpointFile, optional

@@ -61,10 +61,11 @@ from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.network.forward import Compute, Pass, Step, WeighDrawn
 from bayesmc.resampling import systematic
 
-#: particles that a path tries, besides the one that its filter came from
-_TRIED = 32
+#: particles that a path tries, besides the one that its filter came from: of 32, errors of paths that never
+#: forget (Kim's model of GNP) were 1.33 times those that are stated, of 96 1.07, of all .85
+_TRIED = 96
 #: particles up to which all are tried
-_ALL = 64
+_ALL = 128
 #: pairs of paths and particles that are looked at at once
 _PAIRS = 1 << 16
 
