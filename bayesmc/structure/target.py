@@ -28,6 +28,8 @@ from bayesmc.structure.recursion import LinkPlan
 
 #: rows of the states on which functions are compared
 _STATES = 6
+#: where a problem keeps stored values at which chains start, ``(1, *plates, *event)``, if somebody says so
+START = "start"
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,12 +304,15 @@ class Target:
 
         Shape ``(states, *plates, *event)``.
         """
-        model = self.model
+        model, start = self.model, self.problem.cache.get(START, {})
         values: Values = dict(self.known)
         for name in self.chain:
             shape = model[name].value_shape
             full = np.broadcast_to(model.probe[name], model.probe_shape + shape)
             values[name] = full.reshape(-1, *shape)[:_STATES]
+            if start:
+                first = start.get(name, values[name][:1])
+                values[name] = np.concatenate([first, values[name][: _STATES - 1]])
         try:
             with marking_invalid(), np.errstate(all="ignore"):
                 for link in self.links:

@@ -21,6 +21,7 @@ from bayesmc.errors import (
     UnknownNodeError,
     ZeroProbabilityError,
 )
+from bayesmc.lowering import is_available
 from bayesmc.network import pose
 from bayesmc.structure.target import target_of
 
@@ -190,9 +191,7 @@ def above_another() -> tuple[bmc.BayesNet, dict[str, Any]]:
     net.add("slow", bmc.HalfNormal(1.0))
     net.add("fast", above, parents=["slow"])
     net.add("z", bmc.Categorical([0.5, 0.5]), plates="row")
-    net.add(
-        "u", lambda z, slow, fast: bmc.Exponential(np.where(z == 0, slow, fast)), plates="row"
-    )
+    net.add("u", lambda z, slow, fast: bmc.Exponential(np.where(z == 0, slow, fast)), plates="row")
     return net, {"u": rng.exponential(np.where(np.arange(60) % 2 == 0, 1.0, 0.2))}
 
 
@@ -430,3 +429,33 @@ def test_known_labels_say_which_component_is_which(is_scaled: bool) -> None:
     assert agreed > 0.8  # and those that are missing follow
     posterior = bmc.infer(net, seen, engine=bmc.Gibbs(60, 40, 4), rng=2)
     assert (posterior["mean"].mean(axis=-2)[..., 0] < 0.0).all()
+
+
+def ordered_rates() -> tuple[bmc.BayesNet, dict[str, Any], dict[str, Any]]:
+    """Rates whose order none of the values that are tried by themselves has."""
+    net = bmc.BayesNet(plates={"k": 9})
+    net.add("rate", bmc.Uniform(0.0, 10.0), plates="k")
+
+    @net.potential
+    def order(rate: Any) -> Any:
+        below = [rate[k] < rate[k + 1] for k in range(8)]
+        return np.where(np.all(bmc.stack(below), axis=-1), 0.0, -np.inf)
+
+    net.add("y", lambda rate: bmc.StudentT(4.0, rate, 0.5), plates="k")
+    return net, {"y": [0.1, 1.2, 0.8, 2, 4, 3, 6, 9, 7.5]}, {"rate": np.arange(9) + 0.5}
+
+
+@pytest.mark.skipif(not is_available(), reason="llvmlite is not installed")
+def test_functions_are_compared_where_the_user_says_that_chains_start() -> None:
+    net, evidence, start = ordered_rates()
+    told = str(bmc.explain(net, evidence, engine=bmc.Gibbs(start=start)))
+    assert "in machine code" in told
+    assert "in machine code" not in str(bmc.explain(net, evidence, engine=bmc.Gibbs()))
+    post = bmc.infer(net, evidence, engine=bmc.Gibbs(start=start, ess=400), rng=0)
+    rates = np.asarray(post["rate"])
+    assert (np.diff(rates, axis=-1) > 0).all()
+    # a start for each chain, and one that is wrong, which the run names
+    many = {"rate": np.tile(start["rate"], (4, 1))}
+    bmc.infer(net, evidence, engine=bmc.Gibbs(draws=20, warmup=20, chains=4, start=many), rng=0)
+    with pytest.raises(bmc.errors.EvidenceError, match="start for 'rate' is -1"):
+        bmc.infer(net, evidence, engine=bmc.Gibbs(start={"rate": -1.0}), rng=0)

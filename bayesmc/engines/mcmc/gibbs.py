@@ -16,6 +16,7 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.given import note_start
 from bayesmc.engines.mcmc.jointly import trajectories_of
 from bayesmc.engines.mcmc.plan import Plan
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
@@ -159,6 +160,7 @@ class Gibbs(ChainEngine):
         return sampler
 
     def _plan(self, problem: Problem) -> Plan:
+        note_start(problem, self.start)
         return plan_of(problem, self.debug, how=How(self.compiled, self.threads))
 
 

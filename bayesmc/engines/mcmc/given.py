@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.proposal import check_targets
-from bayesmc.errors import EvidenceError, ShapeError
+from bayesmc.errors import BayesmcError, EvidenceError, ShapeError
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.evidence import store
 from bayesmc.shapes import broadcasts_to, first_index
+from bayesmc.structure.target import START
 
 
 def frozen_start(engine: str, start: Any) -> dict[str, Any] | None:
@@ -63,6 +64,24 @@ def read_start(
         check_targets(engine, problem, name, "start")
         found[name] = _read(engine, problem, problem.model[name], value, chains)
     return found
+
+
+def note_start(problem: Problem, start: Mapping[str, Any] | None) -> None:
+    """Have functions compared where chains start, too: orders may rule out all other values that are tried.
+
+    What is wrong with a start the run says.
+    """
+    if not start or START in problem.cache:
+        return
+    one = {}
+    for name, value in start.items():
+        node = problem.model.nodes.get(name)
+        many = node is not None and np.ndim(value) > len(node.value_shape)
+        one[name] = np.asarray(value)[:1] if many else value
+    try:
+        problem.cache[START] = read_start("", problem, one, 1)
+    except (BayesmcError, TypeError, ValueError):
+        problem.cache[START] = {}
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, get_args
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Plan, plan_of
+from bayesmc.engines.mcmc.given import note_start
 from bayesmc.engines.mcmc.jointly import continuous, density_of, jumping, summed_with
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import check_count
@@ -206,6 +207,7 @@ class HamiltonianMonteCarlo(ChainEngine):
 
     def _plan(self, problem: Problem) -> Plan:
         """Kernels of what is finite, and one for all that is continuous."""
+        note_start(problem, self.start)
         target = target_of(problem)
         moving = self._moving(problem)
         summed = self.summed(problem)
