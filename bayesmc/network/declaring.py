@@ -108,6 +108,8 @@ def declared_potential(
     name: str, function: Callable[..., Any], parents: Parents, plates: tuple[str, ...]
 ) -> Potential:
     """A log factor by a function of nodes."""
+    if not isinstance(name, str):
+        raise ModelError(f"net.potential({name!r}, ...): the name comes first, then the function")
     names, bound = bind(name, function, parents)
     return Potential(name, names, bound, plates, captured=captured(function))
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import DuplicateNodeError, EvidenceError, ModelError, UnknownNodeError
+from bayesmc.errors import DuplicateNodeError, EvidenceError, UnknownNodeError
 from bayesmc.network.declaring import (
     Declared,
     DeclaredPlates,
@@ -176,7 +176,7 @@ class BayesNet(Declared):
 
     def potential(
         self,
-        name: str | Callable[..., Any] | None = None,
+        name: Any = None,
         function: Callable[..., Any] | None = None,
         parents: Parents = None,
         plates: str | Sequence[str] = (),
@@ -185,29 +185,11 @@ class BayesNet(Declared):
 
         Without ``plates`` the function sees plated nodes as foreign and reduces them (``x.sum("point")``);
         with them it acts element by element and the elements are summed. Without ``function`` it is a
-        decorator; the name is that of the function if none is given.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import bayesmc as bmc
-        >>> net = bmc.BayesNet()
-        >>> net.add("a", bmc.Uniform(0.0, 1.0))
-        >>> net.add("b", bmc.Uniform(0.0, 1.0))
-        >>> @net.potential
-        ... def order(a, b):
-        ...     return np.where(a < b, 0.0, -np.inf)
-        >>> net.potentials["order"].parents
-        ('a', 'b')
+        decorator, ``@net.potential``, ``@net.potential("name", plates="row")``.
         """
-        if function is None and (name is None or callable(name)):
-            return decorating(name, None, self.potential, (parents, plates), {}, "potential")
         if function is None:
-            return decorating(None, str(name), self.potential, (parents, plates), {}, "potential")
-        if not isinstance(name, str):
-            raise ModelError(
-                f"net.potential({name!r}, ...): the name comes first, then the function"
-            )
+            own, given = (name, None) if isinstance(name, str) else (None, name)
+            return decorating(given, own, self.potential, (parents, plates), {}, "potential")
         within = self._plates.of(f"node {name!r}", plates)
         found = declared_potential(name, function, parents, within)
         if name in self._declarations or name in self._potentials:
@@ -459,12 +441,8 @@ class BayesNet(Declared):
 
     def _unbatched(self, name: str, value: Any) -> Any:
         """A stand-in with the value's plate axes in front, for reading plate sizes off it."""
-        declaration = self._declarations[name]
-        if not declaration.plates or all(
-            self._plates.sizes[p] is not None for p in declaration.plates
-        ):
+        plates, sizes = self._declarations[name].plates, self._plates.sizes
+        if all(sizes[p] is not None for p in plates):
             return None
-        event = len(self._store.probe(self._plates.sizes)[name].event_shape)
-        shape = np.shape(value)
-        lead = len(shape) - event - len(declaration.plates)
-        return np.empty(shape[lead:], dtype=bool) if lead >= 0 else None
+        lead = np.ndim(value) - len(self._store.probe(sizes)[name].event_shape) - len(plates)
+        return np.empty(np.shape(value)[lead:], dtype=bool) if lead >= 0 else None

@@ -28,8 +28,6 @@ from bayesmc.structure.recursion import LinkPlan
 
 #: rows of the states on which functions are compared
 _STATES = 6
-#: where a problem keeps stored values at which chains start, ``(1, *plates, *event)``, if somebody says so
-START = "start"
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,19 +298,14 @@ class Target:
 
     @cached_property
     def states(self) -> Values | None:
-        """A few reachable values of all nodes, to compare functions on; None where they cannot be had.
-
-        Shape ``(states, *plates, *event)``.
-        """
-        model, start = self.model, self.problem.cache.get(START, {})
+        """Reachable values of all nodes, to compare functions on, ``(states, *plates, *event)``; or None."""
+        model, start = self.model, self.problem.cache.get("start", {})  # of ``mcmc.given``
         values: Values = dict(self.known)
         for name in self.chain:
             shape = model[name].value_shape
-            full = np.broadcast_to(model.probe[name], model.probe_shape + shape)
-            values[name] = full.reshape(-1, *shape)[:_STATES]
-            if start:
-                first = start.get(name, values[name][:1])
-                values[name] = np.concatenate([first, values[name][: _STATES - 1]])
+            rows = np.broadcast_to(model.probe[name], model.probe_shape + shape).reshape(-1, *shape)
+            first = start.get(name, rows[:1]) if start else rows[:0]
+            values[name] = np.concatenate([first, rows])[:_STATES]
         try:
             with marking_invalid(), np.errstate(all="ignore"):
                 for link in self.links:

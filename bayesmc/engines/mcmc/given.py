@@ -12,7 +12,6 @@ from bayesmc.errors import BayesmcError, EvidenceError, ShapeError
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.evidence import store
 from bayesmc.shapes import broadcasts_to, first_index
-from bayesmc.structure.target import START
 
 
 def frozen_start(engine: str, start: Any) -> dict[str, Any] | None:
@@ -69,9 +68,9 @@ def read_start(
 def note_start(problem: Problem, start: Mapping[str, Any] | None) -> None:
     """Have functions compared where chains start, too: orders may rule out all other values that are tried.
 
-    What is wrong with a start the run says.
+    ``Target.states`` has them. What is wrong with a start the run says.
     """
-    if not start or START in problem.cache:
+    if not start or "start" in problem.cache:
         return
     one = {}
     for name, value in start.items():
@@ -79,9 +78,9 @@ def note_start(problem: Problem, start: Mapping[str, Any] | None) -> None:
         many = node is not None and np.ndim(value) > len(node.value_shape)
         one[name] = np.asarray(value)[:1] if many else value
     try:
-        problem.cache[START] = read_start("", problem, one, 1)
+        problem.cache["start"] = read_start("", problem, one, 1)
     except (BayesmcError, TypeError, ValueError):
-        problem.cache[START] = {}
+        problem.cache["start"] = {}
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -351,8 +351,7 @@ def _drawn_all(
     With them, by node, the draws whose own parameters are out of range, shape ``(count,)``; and nodes that
     are not drawn from their own density, which may be zero there.
     """
-    undefined: dict[str, np.ndarray] = {}
-    elsewhere: set[str] = set()
+    undefined, elsewhere = dict[str, np.ndarray](), set[str]()
 
     def value(node: CompiledNode, values: Values) -> np.ndarray:
         if node.name in given:
@@ -360,8 +359,7 @@ def _drawn_all(
         drawn = _drawn(target, node, values, count, spread, rng, undefined)
         if drawn is None:
             elsewhere.add(node.name)
-            return _of_support(node, count, rng)
-        return drawn
+        return _of_support(node, count, rng) if drawn is None else drawn
 
     return in_order(target, count, value), undefined, elsewhere
 
