@@ -92,7 +92,8 @@ def filter(
     Warns
     -----
     EngineWarning
-        ``keep`` or ``queries`` has another engine answer than would without it.
+        ``keep`` or ``queries`` has another engine answer than would without it; or Gaussians were merged by a
+        ``SwitchingKalmanFilter`` that nobody named, and that matters (``forecast``, too).
 
     Examples
     --------
@@ -358,7 +359,10 @@ def _filtered(
     run = _begun(problem, engine, seed, options)
     with run.kept, picks_told(problem.slices, problem.series):
         found = run.answer or run.engine.filter(problem, run.seed, **run.options)
-        return run.ended(problem, found)
+        found = run.ended(problem, found)
+    if engine is None:
+        warn_where_merging_matters("filter", found, problem)
+    return found
 
 
 def _smoothed(
@@ -390,6 +394,8 @@ def _smoothed(
         else:
             with picks_told(problem.slices, problem.series):
                 found = chosen.smooth(problem, own, **given)
+            if engine is None:
+                warn_where_merging_matters("smooth", found, problem, options["lag"])
         whole = found.steps == problem.steps and not getattr(found, "interrupted", False)
         if file is not None and whole:
             file.finish(found)

@@ -129,6 +129,7 @@ def _sinc(x: Any) -> Any:
 
 def _cumprod(a: Any, axis: Any = None) -> Any:
     """By doubling: after each round entries are products of twice as many."""
+    a = a if a.dtype.kind in "fc" else a.astype(int)
     if axis is None:
         a, axis = np.reshape(a, (-1,)), 0
     size, width = a.shape[axis], 1
@@ -160,9 +161,11 @@ def _interp(
     xs, ys = np.asarray(knots, dtype=float), np.asarray(heights, dtype=float)
     if period is not None or xs.ndim != 1 or xs.shape != ys.shape or len(xs) < 2:
         return NotImplemented
-    widths = np.diff(xs)
-    if not (np.isfinite(xs).all() and (widths > 0).all()):
-        return NotImplemented
+    with np.errstate(all="ignore"):
+        widths = np.diff(xs)
+        slopes = np.diff(ys) / widths
+    if not ((widths > 0).all() and np.isfinite([*widths, *slopes, *xs, *ys]).all()):
+        return NotImplemented  # NumPy makes more of what is infinite
     inside = np.minimum(np.maximum(x, xs[0]), xs[-1])
     rounds = int(np.ceil(np.log2(len(widths))))
     starts = np.full(2**rounds, np.inf)
@@ -170,7 +173,6 @@ def _interp(
     at: Any = np.zeros(x.shape, dtype=np.intp)
     for step in 2 ** np.arange(rounds)[::-1]:
         at = np.where(inside >= _looked_up(starts, at + step), at + step, at)
-    slopes = np.diff(ys) / widths
     found = _looked_up(ys, at) + _looked_up(slopes, at) * (inside - _looked_up(xs, at))
     found = np.where(x < xs[0], ys[0] if left is None else left, found)
     return np.where(x > xs[-1], ys[-1] if right is None else right, found)

@@ -177,7 +177,7 @@ class BayesNet(Declared):
     def potential(
         self,
         name: Any = None,
-        function: Callable[..., Any] | None = None,
+        function: Any = ...,
         parents: Parents = None,
         plates: str | Sequence[str] = (),
     ) -> Any:
@@ -187,8 +187,9 @@ class BayesNet(Declared):
         with them it acts element by element and the elements are summed. Without ``function`` it is a
         decorator, ``@net.potential``, ``@net.potential("name", plates="row")``.
         """
-        if function is None:
-            own, given = (name, None) if isinstance(name, str) else (None, name)
+        if function is ... or name is None:
+            own = name if isinstance(name, str) else None
+            given = function if function is not ... else None if own else name
             return decorating(given, own, self.potential, (parents, plates), {}, "potential")
         within = self._plates.of(f"node {name!r}", plates)
         found = declared_potential(name, function, parents, within)

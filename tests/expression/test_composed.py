@@ -15,7 +15,7 @@ X = TracedArray(leaf("x", (2, 3)))
 ODD = np.array([-np.inf, -3.0, -1.0, 0.25, 2.0, 5.0, np.inf, np.nan])
 
 
-@pytest.mark.parametrize("count", [2, 3, 5, 9])
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 7, 9])
 @pytest.mark.parametrize("ends", [{}, {"left": -7.0}, {"right": np.nan}, {"left": 1, "right": 2}])
 def test_interpolation_among_known_knots_is_that_of_numpy(count: int, ends: dict) -> None:
     rng = np.random.default_rng(count)
@@ -33,8 +33,10 @@ def test_interpolation_among_known_knots_is_that_of_numpy(count: int, ends: dict
         lambda x: np.interp(x, [0.0, 1.0, 1.0, 2.0], [0.0, 1.0, 3.0, 4.0]),  # a jump
         lambda x: np.interp(x, [0.0, 1.0], [3.0, 4.0], period=2.0),
         lambda x: np.interp(x, [0.5], [3.0]),
+        lambda x: np.interp(x, [0.0, 1.0, 3.0], [0.0, 1.0, -np.inf]),
+        lambda x: np.interp(x, [0.0, 5e-324, 3.0], [0.0, 1.0, 2.0]),
     ],
-    ids=["jump", "period", "one"],
+    ids=["jump", "period", "one", "infinite", "steep"],
 )
 def test_other_interpolation_is_called_as_it_stands(how: Any) -> None:
     x = np.array([-0.3, 0.2, 1.0, 1.4, 9.0])
@@ -61,3 +63,9 @@ def test_running_products_are_those_of_numpy(axis: int | None, size: int) -> Non
     (found,) = Program([root])({"x": x[None]})
     np.testing.assert_allclose(found[0], np.cumprod(x, axis=axis), rtol=1e-14)
     assert X.cumprod(axis=0).expression is np.cumprod(X, axis=0).expression
+
+
+def test_running_products_of_truths_are_counts() -> None:
+    x = np.array([2.0, 2.0, 0.5, 2.0])
+    root = trace(lambda x: np.cumprod(x > 0) + np.cumprod(x > 1), [TracedArray(leaf("x", x.shape))])
+    assert Program([root])({"x": x[None]})[0].tolist() == [[2, 2, 1, 1]]

@@ -561,11 +561,22 @@ def test_potentials_by_decorators():
     def each(b):
         return -(b**2)
 
+    @net.potential(parents=["a", "b"])
+    def both(x, y):
+        return -((x - y.sum("row")) ** 2)
+
+    net.potential(function=lambda a: -a, name="named")
     assert net.potentials["order"].parents == ("a", "b") and order is not None
+    assert net.potentials["both"].parents == ("a", "b")
+    assert net.potentials["named"].parents == ("a",)
     assert net.potentials["near"].parents == ("a",)
     assert net.potentials["each"].plates == ("row",)
     with pytest.raises(bmc.errors.ModelError, match="the name comes first"):
         net.potential(order, "order")
+    with pytest.raises(bmc.errors.ModelError, match="it decorates a function"):
+        net.potential(3)
+    with pytest.raises(bmc.errors.ModelError):
+        net.potential("nothing", None)
     with pytest.raises(bmc.errors.ModelError, match="no name to give the potential"):
         net.potential(lambda a: -(a**2))
     with pytest.raises(bmc.errors.DuplicateNodeError):

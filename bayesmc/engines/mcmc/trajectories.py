@@ -69,11 +69,15 @@ def faulty_trajectories(
             )
         ratio = float(np.nanmin(kernel.energy_ratio(memory))) if memory["moves"] > 100 else np.inf
         if ratio < _LEAST_RATIO:
+            tied = (
+                "write what a potential ties to its scale as scale * z with the potential on z, "
+                if posterior.model.potentials
+                else ""
+            )
             yield (
                 f"energies change slowly (E-BFMI {ratio:.2f}, under {_LEAST_RATIO}): heavy tails or a funnel "
-                f"are explored slowly, if at all; {_apart_from(kernel, memory, kernels)}declare heavy tails "
-                "as a scale mixture, what a potential ties to its scale as scale * z with the potential on "
-                "z, or give tighter priors"
+                f"are explored slowly, if at all; {_apart_from(kernel, memory, kernels)}{tied}declare heavy "
+                "tails as a scale mixture, or give tighter priors"
             )
 
 
