@@ -418,7 +418,8 @@ class DynamicBayesNet:
             )
             raise ModelError(
                 f"node {name!r}: initial{what}; give the density of slice 0, such as Normal(0.0, 1.0), a "
-                "function that returns one, or a list of probabilities"
+                "function that returns one, or a list of probabilities; of a computed node a function of "
+                f"what it is, such as lambda: {initial if is_number else 1.0}"
             )
         vectorize = vectorize and callable(initial)
         return self._read(name, BayesNet.add, initial, None, plates, states, vectorize=vectorize)
