@@ -33,7 +33,7 @@ _FEWEST = 15
 #: what an undamped sweep may still change, of a belief in standard deviations, for it to be an answer
 _NEAR = 0.1
 #: differences that merging sooner makes, of the log evidence and of probabilities, of which nobody is told
-_SAME = 0.05
+_SAME = 0.05, 0.1
 #: the same where rows are missing: what rounding leaves where modes make no difference
 _ROUNDED = 1e-8
 #: why it is taken
@@ -95,8 +95,9 @@ def warn_where_merging_matters(
         if rough.steps < found.steps:
             return
         evidence, probability = _differences(found, rough)
-        most, gap = max(evidence, probability), _has_gap(problem)
-        if most <= (_ROUNDED if gap else _SAME):
+        gap = _has_gap(problem)
+        same = (_ROUNDED, _ROUNDED) if gap else _SAME
+        if evidence <= same[0] and probability <= same[1]:
             return
         differs = (
             f"merged sooner (merging='gpb1') the log evidence differs by {evidence:.2g} and probabilities by "
