@@ -33,7 +33,7 @@ _FEWEST = 15
 #: what an undamped sweep may still change, of a belief in standard deviations, for it to be an answer
 _NEAR = 0.1
 #: differences that merging sooner makes, of the log evidence and of probabilities, of which nobody is told
-_SAME = 0.05, 0.1
+_SAME = 0.1, 0.1
 #: the same where rows are missing: what rounding leaves where modes make no difference
 _ROUNDED = 1e-8
 #: why it is taken

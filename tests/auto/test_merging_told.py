@@ -69,7 +69,7 @@ def test_differences_are_those_of_both_filters() -> None:
 
 def test_what_evidence_alone_tells_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     dbn, rows = system(1)
-    for pair, spoken in [((0.06, 0.0), True), ((0.0, 0.11), True), ((0.04, 0.09), False)]:
+    for pair, spoken in [((0.11, 0.0), True), ((0.0, 0.11), True), ((0.09, 0.09), False)]:
         monkeypatch.setattr(switching, "_differences", lambda *_, pair=pair: pair)
         assert ("merges Gaussians" in told(dbn, rows)[0]) == spoken
 
