@@ -4,8 +4,8 @@ Every particle drives its own way, and carries a small Kalman filter for each la
 are independent (FastSLAM). The map is one plate of a dynamic Bayes net, static in time, that
 ``ParticleFilter(marginalize="mark")`` integrates out. Three ways to ask are compared:
 
-- *known*: readings wear the barcode of their landmark, an input of the net.
-- *unknown*: which landmark a reading is of, a new one or none, is a finite node, drawn by each particle
+- known: readings wear the barcode of their landmark, an input of the net.
+- unknown: which landmark a reading is of, a new one or none, is a finite node, drawn by each particle
   from its posterior. Nothing is told but ranges and bearings.
 - the same net under an extended Kalman filter (EKF-SLAM): one Gaussian of pose and landmarks. It makes
   readings linear at the prior mean, so it cannot place a landmark that it knows nothing of: all engines are
