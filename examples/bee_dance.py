@@ -13,11 +13,11 @@ any other number; stages make short ones rare. The heading jumps by full turns a
 
 Three ways to the numbers, which are not equally honest, and agreement with what a person says of the frames:
 
-- *by a stretch*: labels of the first 450 frames; agreement is told of the 675 others as well;
-- *by no labels*: from rough numbers (below) the frames are labelled, numbers learned from these labels, and
+- by a stretch: labels of the first 450 frames; agreement is told of the 675 others as well;
+- by no labels: from rough numbers (below) the frames are labelled, numbers learned from these labels, and
   so on. The rough numbers stand on what the words mean and on a look at the track. They matter: with half
   the ``wobble`` it takes more rounds, with twice as much no frame is a waggle any more;
-- *by all labels* of the sequence that is labelled then: what the model can do, no forecast of anything.
+- by all labels of the sequence that is labelled then: what the model can do, no forecast of anything.
 
 Given labels the dance is a Kalman filter's, and numbers come by EM (Shumway and Stoffer 1982): from means
 and variances of what the smoother says of ``turned``, ``pushed`` and what is left of the measurements, phase

@@ -4,8 +4,8 @@ Ranges of such radios come out too long, by how much depends on antennas and gro
 hand: the *bias* is a node, known to within 5 m at the start, and the filters find it with the path. It is
 declared in two ways.
 
-- *constant*: one number for all ranges.
-- *growing*: a bias for a range of 40 m, and by how much it grows per metre of range. On the Plaza all four
+- constant: one number for all ranges.
+- growing: a bias for a range of 40 m, and by how much it grows per metre of range. On the Plaza all four
   beacons say that it does, and the error of the position is a quarter of that with a constant.
 
 Both are parameters; but a particle filter that never moves a parameter is left with few of its values, so the
