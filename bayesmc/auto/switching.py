@@ -83,9 +83,9 @@ def warn_where_merging_matters(
         with warnings.catch_warnings():  # whoever stops this has his answer
             warnings.simplefilter("ignore", (InterruptWarning, EngineWarning))
             rough = (
-                sooner.filter(problem, seed, progress=False)
-                if lag is None
-                else sooner.smooth(problem, seed, lag=lag, progress=False)
+                sooner.smooth(problem, seed, lag=lag, progress=False)
+                if call == "smooth"
+                else sooner.filter(problem, seed, progress=False)
             )
     except BayesmcError:
         rough = None

@@ -10,7 +10,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc import SwitchingKalmanFilter
-from bayesmc.auto import switching
+from bayesmc.auto import choosing, switching
 from bayesmc.errors import EngineWarning
 from bayesmc.testing import session
 from bayesmc.testing.makers.switching_dbns import random_switching_dbn
@@ -80,6 +80,15 @@ def test_several_series_and_fixed_lags_are_told_of() -> None:
         bmc.filter(dbn, [rows, rows])
     with pytest.warns(EngineWarning, match="smooth: SwitchingKalmanFilter answers"):
         bmc.smooth(dbn, rows, lag=2)
+
+
+def test_smoothers_are_held_against_smoothers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choosing, "why_too_long", lambda *_: "too long")
+    dbn, rows = system(1)
+    both = [bmc.smooth(dbn, rows, engine=bmc.SwitchingKalmanFilter(r)) for r in ("gpb2", "gpb1")]
+    probability = np.abs(np.subtract(*(f.probabilities("s") for f in both))).max()
+    with pytest.warns(EngineWarning, match=f"smooth: .*by up to {probability:.2g}"):
+        bmc.smooth(dbn, rows)
 
 
 @pytest.mark.parametrize("shorter", [True, False])
