@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from examples import slam_landmarks
+from examples.robot_landmarks import marks_seen, write_mrclam
 from examples.slam_landmarks import Readings, by_camera, instants, turned
 
 
@@ -126,3 +128,20 @@ def test_the_way_between_readings_is_what_the_stretches_add_up_to() -> None:
     cov = np.cov(np.array([gone(np.ones(2), n) for n in noise]).T)
     scale = np.sqrt(np.outer(np.diag(cov), np.diag(cov)))
     assert (np.abs(found.noise[1] - cov) < 0.11 * scale).all()
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")  # six particles
+def test_runs_are_averaged_each_counting_the_same(tmp_path: Path) -> None:
+    """Variances are those within the runs, and what their means are apart."""
+    drive = marks_seen(write_mrclam(tmp_path, 30.0, depths=True), 1)
+    readings = instants(drive, 4.0)
+    found = slam_landmarks.averaged(readings, drive, 6, 3)
+    engine = slam_landmarks.fast_slam(6)
+    own = [slam_landmarks.with_labels(readings, drive, engine, seed=seed) for seed in range(3)]
+    for name in ("pose", "mark"):
+        means = np.stack([f.mean(name) for f in own])
+        assert (means[0] != means[1]).any()
+        np.testing.assert_allclose(found.mean(name), means.mean(axis=0), rtol=1e-12)
+        apart = np.square(means - means.mean(axis=0)).mean(axis=0)
+        within = sum(f.var(name) for f in own) / 3
+        np.testing.assert_allclose(found.var(name), within + apart, rtol=1e-12, atol=1e-15)

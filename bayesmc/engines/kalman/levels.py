@@ -218,9 +218,14 @@ class Part(NamedTuple):
 
 
 class Plan:
-    """The levels of a slice, of which ``values`` are what is known, to trace functions with."""
+    """The levels of a slice, of which ``values`` are what is known, to trace functions with.
 
-    def __init__(self, layout: Layout, values: Mapping[str, np.ndarray]) -> None:
+    With ``seen_last`` all that is seen is a level of its own, after the others.
+    """
+
+    def __init__(
+        self, layout: Layout, values: Mapping[str, np.ndarray], seen_last: bool = False
+    ) -> None:
         self.layout, self.values = layout, values
         self.before = {n + PREVIOUS: n for n in layout.before}
         self.sources: dict[str, tuple[str, ...]] = {}
@@ -233,6 +238,8 @@ class Plan:
                 (depth[s] for s in self.sources[name] if s in layout.rows), default=-1
             )
         placed = [n for n in names if n not in layout.silent]
+        if seen_last:
+            depth.update(dict.fromkeys(layout.seen, len(names)))
         levels = sorted({depth[n] for n in placed})
         self.levels = [self._part([n for n in placed if depth[n] == d], names) for d in levels]
 

@@ -20,6 +20,8 @@ from bayesmc.dbn import Row
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.gaussians import Coefficients
+from bayesmc.engines.marginal.linearised import LinearisedReader
+from bayesmc.engines.marginal.predictive import Expected
 from bayesmc.engines.marginal.reading import Kinds, SliceReader, Values
 from bayesmc.engines.particles.smc import along_plates
 from bayesmc.engines.slice_steps import SlicePlan
@@ -83,6 +85,7 @@ class Choices:
         self.count = int(np.prod(sizes))
         self._kept: dict[tuple[tuple[str, ...], int], int] = {}
         self._made: list[np.ndarray] = []
+        self._seen_alone: bool | None = None
         self.values = {
             n.name: np.broadcast_to(v, (*sizes, *n.plate_shape)).reshape(-1, *n.plate_shape)
             for n, v in zip(nodes, found, strict=True)
@@ -106,6 +109,18 @@ class Choices:
             log, made, kind = self._remembered(values, kinds, row, reader)
         offset = made.offset.take(kind, axis=0)
         return log.take(kind, axis=0), Coefficients(offset, made.moves, made.noise, kind)
+
+    def expected(
+        self, values: Values, row: Row, reader: LinearisedReader
+    ) -> tuple[np.ndarray, Expected] | None:
+        """As `read`, where of all numbers only what is seen depends on the choice; else None."""
+        both = self._with_choices(values, None)
+        if self._seen_alone is None:
+            self._seen_alone = reader.seen_alone(self.names, both)
+        if not self._seen_alone:
+            return None
+        log = self._log_factors(dict(both), row).reshape(values.particles, self.count)
+        return log, reader.expected(values.at(None), both, self.count)
 
     def drawn(self, log: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """The logs' sums over choices, and one choice for each particle by them, shape (particles, *lead)."""
@@ -160,14 +175,20 @@ class Choices:
     ) -> tuple[np.ndarray, Linear]:
         """Log densities and coefficients by kind and choice; every particle is a kind with None."""
         count = values.particles if which is None else len(which)
+        both = self._with_choices(values, which)
+        log = self._log_factors(dict(both), row).reshape(count, self.count, *self.layout.lead)
+        return log, reader.read_choices(both, count, self.count)
+
+    def _with_choices(self, values: Values, which: np.ndarray | None) -> dict[str, np.ndarray]:
+        """Known values with an axis of kinds and choices together first."""
+        count = values.particles if which is None else len(which)
         both = {
             name: value.repeat(self.count, axis=0) if name in values.own else value
             for name, value in values.at(which).items()
         }
         for name, value in self.values.items():
             both[name] = np.tile(value, (count, *(1,) * (value.ndim - 1)))
-        log = self._log_factors(dict(both), row).reshape(count, self.count, *self.layout.lead)
-        return log, reader.read_choices(both, count, self.count)
+        return both
 
     def _log_factors(self, values: dict[str, np.ndarray], row: Row) -> np.ndarray:
         """Log densities of all nodes that have a value, shape (kinds * choices, *lead)."""

@@ -33,7 +33,8 @@ from bayesmc.engines.kalman.levels import Followed, Level, Part, Plan
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout, put_noise
 from bayesmc.engines.marginal.gaussians import Coefficients, Gaussians
-from bayesmc.engines.marginal.reading import Kinds, SliceReader, Values
+from bayesmc.engines.marginal.predictive import Expected
+from bayesmc.engines.marginal.reading import Kinds, SliceReader, Values, leaves_of
 from bayesmc.errors import TraceError
 from bayesmc.expression import Family, expressions_of
 from bayesmc.network.expressions import Opaque, density
@@ -105,7 +106,8 @@ class LinearisedReader(SliceReader):
 
     def __init__(self, layout: Layout) -> None:
         super().__init__(layout)
-        self._plans: list[Plan] = []
+        #: shared by all copies of the reader; with True what is seen is a level of its own
+        self._plans: dict[bool, Plan] = {}
 
     def at(self, before: Gaussians) -> LinearisedReader:
         found = copy.copy(self)
@@ -124,28 +126,107 @@ class LinearisedReader(SliceReader):
         made = self._linearised(dict(values), self.before.mean.repeat(choices, axis=0))
         return Linear(*(a.reshape(kinds, choices, *a.shape[1:]) for a in made))
 
+    def seen_alone(self, names: Collection[str], values: Mapping[str, np.ndarray]) -> bool:
+        """Whether, of all numbers of the slice, only seen ones depend on some known nodes.
+
+        Parameters
+        ----------
+        values : dict
+            What is known of the slice, and of the one before, to trace functions with.
+        """
+        parts, _ = self._apart(self._completed(values))
+        return not any(leaves_of(self.layout, part.order) & set(names) for part in parts)
+
+    def expected(
+        self, own: Mapping[str, np.ndarray], both: Mapping[str, np.ndarray], choices: int
+    ) -> Expected:
+        """The slice linearised once for each particle, and what is seen of it for each choice as well.
+
+        Parameters
+        ----------
+        own : dict
+            Known values, without those of the choices.
+        both : dict
+            With them; an axis of particles and choices together first.
+        """
+        layout, before = self.layout, self.before
+        n = layout.n_prev
+        unknown, seen = self._completed(own, partly=True), self._completed(both)
+        parts, last = self._apart(seen)
+        centre, rows = self._begun(before.mean)
+        for part in parts:
+            centre, rows = self._passed(part, unknown, centre, rows)
+        split, k, places = (len(centre), choices), rows.shape[-1], last.places - n
+        level = _Batch(layout, last, seen)
+        found, slopes, fresh = level.tangents(centre[:, last.reads].repeat(choices, axis=0))
+        means = np.zeros((*split, layout.p))
+        means[..., places] = found.reshape(*split, -1)
+        slopes = slopes.reshape(*split, *slopes.shape[1:])
+        seen_rows = np.zeros((*split, layout.p, k + layout.p))
+        seen_rows[..., places, :k] = slopes @ rows[:, None, last.reads]
+        seen_rows[..., places, k:] = fresh.reshape(*split, *fresh.shape[1:])
+        # what the slice before is uncertain by, in place of its numbers
+        roots = before.roots()
+
+        def told(moved: np.ndarray, left: np.ndarray) -> np.ndarray:
+            return np.concatenate([moved[..., :n] @ left, moved[..., n:]], axis=-1)
+
+        at = slice(n + layout.p, None)
+        return Expected(
+            centre[:, at], told(rows[:, at], roots), means, told(seen_rows, roots[:, None])
+        )
+
     # ---- private -------------------------------------------------------------------------------
 
-    def _linearised(self, values: dict[str, np.ndarray], mean: np.ndarray) -> Linear:
-        """Tangents at means, shape ``(batch, *lead, n_prev)``."""
-        layout = self.layout
+    def _completed(
+        self, values: Mapping[str, np.ndarray], partly: bool = False
+    ) -> dict[str, np.ndarray]:
+        """With what is computed from known values; ``partly`` from those there are."""
+        layout, found = self.layout, dict(values)
         for name in layout.computed:
-            values[name] = layout.model.evaluate(name, values)[0]
-        if not self._plans:
-            self._plans.append(Plan(layout, values))
-        n, total = layout.n_prev, layout.n_prev + layout.p + layout.n
-        shape = mean.shape[:-1]
+            if partly and not all(p in found for p in layout.model[name].parents):
+                continue
+            found[name] = layout.model.evaluate(name, found)[0]
+        return found
+
+    def _plan(self, values: Mapping[str, np.ndarray], seen_last: bool = False) -> Plan:
+        if seen_last not in self._plans:
+            self._plans[seen_last] = Plan(self.layout, values, seen_last)
+        return self._plans[seen_last]
+
+    def _apart(self, values: Mapping[str, np.ndarray]) -> tuple[list[Part], Part]:
+        """The levels of unknown numbers, and what is seen as a level after these."""
+        *parts, last = self._plan(values, seen_last=True).levels
+        return parts, last
+
+    def _begun(self, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places and rows of all numbers, those of the slice before filled in."""
+        n = self.layout.n_prev
+        total, shape = n + self.layout.p + self.layout.n, mean.shape[:-1]
         centre, rows = np.zeros((*shape, total)), np.zeros((*shape, total, n))
         centre[..., :n] = mean
         rows[..., np.arange(n), np.arange(n)] = 1.0
-        for part in self._plans[0].levels:
-            level = _Batch(layout, part, values)
-            found, slopes, fresh = level.tangents(centre[..., part.reads])
-            wider = np.zeros((*shape, total, fresh.shape[-1]))
-            rows = np.concatenate([rows, wider], axis=-1)
-            own = slopes @ rows[..., part.reads, :]
-            own[..., own.shape[-1] - fresh.shape[-1] :] += fresh
-            centre[..., part.places], rows[..., part.places, :] = found, own
+        return centre, rows
+
+    def _passed(
+        self, part: Part, values: Mapping[str, np.ndarray], centre: np.ndarray, rows: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A level put in its places: values at means, and rows of what they read and of noise."""
+        level = _Batch(self.layout, part, values)
+        found, slopes, fresh = level.tangents(centre[..., part.reads])
+        wider = np.zeros((*rows.shape[:-1], fresh.shape[-1]))
+        rows = np.concatenate([rows, wider], axis=-1)
+        own = slopes @ rows[..., part.reads, :]
+        own[..., own.shape[-1] - fresh.shape[-1] :] += fresh
+        centre[..., part.places], rows[..., part.places, :] = found, own
+        return centre, rows
+
+    def _linearised(self, values: dict[str, np.ndarray], mean: np.ndarray) -> Linear:
+        """Tangents at means, shape ``(batch, *lead, n_prev)``."""
+        n, values = self.layout.n_prev, self._completed(values)
+        centre, rows = self._begun(mean)
+        for part in self._plan(values).levels:
+            centre, rows = self._passed(part, values, centre, rows)
         moves = rows[..., n:, :n]
         return Linear(centre[..., n:] - np.matvec(moves, mean), moves, rows[..., n:, n:])
 

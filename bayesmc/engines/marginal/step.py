@@ -25,6 +25,7 @@ from bayesmc.engines.marginal.choices import Choices
 from bayesmc.engines.marginal.gaussians import Coefficients, Gaussians, Taken, nothing, take_in
 from bayesmc.engines.marginal.lagging import newest, told_more
 from bayesmc.engines.marginal.linearised import LinearisedReader
+from bayesmc.engines.marginal.predictive import Weighed, weighed
 from bayesmc.engines.marginal.reading import SliceReader, Values
 from bayesmc.engines.marginal.scouting import MarginalScouting
 from bayesmc.engines.marginal.split import Split, blocks_of
@@ -210,17 +211,17 @@ class MarginalStep(FilterStep):
             if self.blocks:
                 own = own.sum(axis=tuple(range(1, own.ndim)))
             return values, log + own, self._looking_back(inner, made, made.chosen(None), pattern)
-        joint, made, coefficients = self.looked(place, place.choices, row, known, inner)
+        joint, each, found = self.looked(place, place.choices, row, known, inner)
         if self.tables is not None:
             every = self._known(row, before, values, selection)
             joint = joint + self.tables.predicted(row, every, tables, place.choices.values)
         own, at = place.choices.drawn(joint, rng)
         values |= self.chosen_values(place, place.choices, known, values, at)
         level = np.where(own > -np.inf, own, 0.0)
-        over = made.averaged(np.exp(joint - level[:, None]))
-        after = made.chosen(at)
-        if self.lag:
-            after = self._again(place, row, inner, coefficients.chosen(at))
+        over = each.averaged(np.exp(joint - level[:, None]))
+        after = each.chosen(at)
+        if self.lag and found is not None:
+            after = self._again(place, row, inner, found.chosen(at))
         return values, log + own, after._replace(over=over)
 
     def _again(self, place: Place, row: Row, before: Gaussians, chosen: Coefficients) -> Gaussians:
@@ -241,9 +242,18 @@ class MarginalStep(FilterStep):
 
     def looked(
         self, place: Place, choices: Choices, row: Row, known: Values, inner: Gaussians
-    ) -> tuple[np.ndarray, Taken, Coefficients]:
-        """The row taken in with every choice of finite nodes; logs have shape (particles, choices, *lead)."""
+    ) -> tuple[np.ndarray, Taken | Weighed, Coefficients | None]:
+        """The row with every choice of finite nodes; logs have shape (particles, choices, *lead).
+
+        There are no coefficients where the choices were weighed together.
+        """
         pattern, target, given = seen_of(place.layout, row)
+        plain = given is None and not place.layout.lead and not self.lag and place.layout.p
+        if plain and isinstance(place.reader, LinearisedReader):
+            told = choices.expected(known, row, place.reader.at(inner))
+            found = told and weighed(place.layout, pattern, told[1], target)
+            if told and found:
+                return told[0] + found.log, found, None
         prior, coefficients = choices.read(known, row, place.reader.at(inner))
         made = take_in(place.layout, pattern, inner, coefficients, target, given)
         return prior + made.log, made, coefficients
