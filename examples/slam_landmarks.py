@@ -643,11 +643,11 @@ def draw(drive: Drive, readings: Readings, found: Any, kalman: Any, spread: np.n
     return figure
 
 
-def log(fast: bool) -> tuple[str, Drive]:
-    """Robot 1 of MRCLAM 6 where the data is, else (or for a smoke test) a generated drive."""
+def log(fast: bool, robot: int = 1) -> tuple[str, Drive]:
+    """A robot of MRCLAM 6 where the data is, else (or for a smoke test) a generated drive."""
     folder = reference.folder("robot", "mrclam6")
     if folder is not None and not fast:
-        return "MRCLAM 6, robot 1", marks_seen(folder, 1)
+        return f"MRCLAM 6, robot {robot}", marks_seen(folder, robot)
     with tempfile.TemporaryDirectory() as made:
         return "a generated drive", marks_seen(
             write_mrclam(Path(made), 60.0 if fast else 200.0, depths=True), 1

@@ -178,7 +178,7 @@ def test_what_is_certain_is_weighed_one_by_one(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_variances_after_a_vague_start_keep_their_digits() -> None:
-    """x by 10^6, seen with a noise of .1: the variance left is 1 / (10^-12 + 100), 14 digits below the first."""
+    """x by 10^6, seen with a noise of .1: the variance left is .01, 14 digits below the first."""
     layout: Any = SimpleNamespace(p=1, angles=None)
     pattern: Any = SimpleNamespace(kept=np.array([1]))
     rows, seen = np.array([[[1e6]]]), np.array([[[[1e6, 0.1]], [[0.0, 1.0]]]])
