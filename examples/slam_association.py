@@ -129,7 +129,7 @@ def draw(drive: Drive, readings: Readings, found: Any, numbers: np.ndarray, othe
         ax.plot(*ellipse(place, np.diag(var)), color=picture.OTHER, lw=1.2)
     low, high = drive.marks.min(axis=0) - 2.0, drive.marks.max(axis=0) + 2.0
     ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    ax.set(xlabel="x in m", ylabel="y in m", title="landmarks that were met, 2 sd")
+    ax.set(xlabel="x in m", ylabel="y in m", title="landmarks that were met, 2 sd, not turned")
     ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=9)
     ax = panels["right"]
     for name, own, colour in (
@@ -140,7 +140,7 @@ def draw(drive: Drive, readings: Readings, found: Any, numbers: np.ndarray, othe
         ax.plot(readings.times, share, color=colour, lw=1.4, label=name)
     ax.set(xlim=(0, readings.times[-1]), ylim=(0, 1.02), xlabel="s")
     ax.set_title("share of readings assigned right so far")
-    ax.legend(frameon=False, loc="lower left")
+    ax.legend(frameon=False, loc="lower right")
     return figure
 
 
