@@ -362,9 +362,7 @@ class Averaged(NamedTuple):
         return self.variances[name]
 
 
-def averaged(
-    readings: Readings, drive: Drive, particles: int, runs: int, guessed: bool = False
-) -> Averaged:
+def averaged(readings: Readings, drive: Drive, particles: int, runs: int) -> Averaged:
     """FastSLAM, run several times by itself; each run counts the same.
 
     What all particles of a run share of their past after many slices, how the map as a whole is turned above
@@ -375,7 +373,7 @@ def averaged(
     Dubarry, Del Moral and Moulines (2015), Statistics and Computing 25, on islands of particles.
     """
     engine, names = fast_slam(particles), ("pose", "mark")
-    found = (with_labels(readings, drive, engine, guessed, seed=seed) for seed in range(runs))
+    found = (with_labels(readings, drive, engine, seed=seed) for seed in range(runs))
     own = [[(f.mean(n), f.var(n)) for n in names] for f in found]
     means, variances = {}, {}
     for name, each in zip(names, zip(*own, strict=True), strict=True):
@@ -533,17 +531,14 @@ def figures(
     for k in robots:
         drive = marks_seen(folder, k)
         readings = instants(drive)
-        vague = averaged(readings, drive, particles, runs)
-        same = averaged(readings, drive, particles, runs, guessed=True)
+        found = averaged(readings, drive, particles, runs)
         kalman = ekf_slam(readings, drive)
         told = ekf_slam(readings, drive, misread(readings, drive.marks))
         yield (
             k,
             {
-                "map": map_rmse(vague.mean("mark")[-1], drive.marks),
-                "pose": readings.rmse(vague.mean("pose")),
-                "map, guessed": map_rmse(same.mean("mark")[-1], drive.marks),
-                "pose, guessed": readings.rmse(same.mean("pose")),
+                "map": map_rmse(found.mean("mark")[-1], drive.marks),
+                "pose": readings.rmse(found.mean("pose")),
                 "map, EKF-SLAM": map_rmse(kalman.mean("mark")[-1], drive.marks),
                 "pose, EKF-SLAM": readings.rmse(kalman.mean("pose")),
                 "map, EKF-SLAM told what is stray": map_rmse(told.mean("mark")[-1], drive.marks),
