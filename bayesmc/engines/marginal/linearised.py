@@ -165,16 +165,18 @@ class LinearisedReader(SliceReader):
         seen_rows = np.zeros((*split, layout.p, k + layout.p))
         seen_rows[..., places, :k] = slopes @ rows[:, None, last.reads]
         seen_rows[..., places, k:] = fresh.reshape(*split, *fresh.shape[1:])
-        # what the slice before is uncertain by, in place of its numbers
         roots = before.roots()
 
-        def told(moved: np.ndarray, left: np.ndarray) -> np.ndarray:
+        def by_normals(moved: np.ndarray, left: np.ndarray) -> np.ndarray:
+            """Coefficients of normals, in place of the numbers of the slice before."""
             return np.concatenate([moved[..., :n] @ left, moved[..., n:]], axis=-1)
 
         at = slice(n + layout.p, None)
-        return Expected(
-            centre[:, at], told(rows[:, at], roots), means, told(seen_rows, roots[:, None])
+        unknown_rows, seen_rows = (
+            by_normals(rows[:, at], roots),
+            by_normals(seen_rows, roots[:, None]),
         )
+        return Expected(centre[:, at], unknown_rows, means, seen_rows)
 
     # ---- private -------------------------------------------------------------------------------
 

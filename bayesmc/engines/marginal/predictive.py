@@ -19,14 +19,14 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.marginal.gaussians import Gaussians
-from bayesmc.gaussian import solve_lower
 from bayesmc.linalg.square_root import condition_many, log_densities, standardised
 
-#: share of a variance that is left of it by a row below which a difference of squares loses too much
-_CLEAR = 1e-6
+#: share of a variance that a row leaves of it, below which a difference of squares loses too much
+_LITTLE = 1e-6
+#: share of a seen number's deviation below which it may follow from those before it
+_CERTAIN = 1e-11
 
 
 class Expected(NamedTuple):
@@ -53,39 +53,32 @@ class Weighed(NamedTuple):
     Attributes
     ----------
     layout : Layout
-    kept : ndarray of int, shape (n,)
-        The order in which unknown numbers are worked out.
     found : Expected
     log : ndarray, shape (particles, choices)
         Log predictive densities of the row.
+    basis : ndarray, shape (particles, choices, p, k + p)
+        The normals that the row tells, standardised innovations, as combinations of all.
     gain : ndarray, shape (particles, choices, n, p)
-        What unknown numbers gain from standardised innovations.
-    root : ndarray, shape (particles, choices, p, p)
-        Of the innovations' covariance.
+        What unknown numbers gain from them.
     mean : ndarray, shape (particles, choices, n)
         Given the row.
     """
 
     layout: Layout
-    kept: np.ndarray
     found: Expected
     log: np.ndarray
+    basis: np.ndarray
     gain: np.ndarray
-    root: np.ndarray
     mean: np.ndarray
 
     def averaged(self, shares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Means and variances over choices, by their shares, shape (particles, choices)."""
-        rows = self.found.rows[:, self.kept]
+        rows = self.found.rows
         whole = np.vecdot(rows, rows)[:, None]
         left = whole - np.vecdot(self.gain, self.gain)
-        one, choice, number = np.nonzero(left < _CLEAR * whole)
-        if len(one):  # by what of the noise the row does not tell
-            basis = solve_lower(
-                self.root[one, choice][:, None],
-                self.found.seen_rows[one, choice].swapaxes(-1, -2),
-            ).swapaxes(-1, -2)
-            rest = -np.vecmat(self.gain[one, choice, number], basis)
+        one, choice, number = np.nonzero(left < _LITTLE * whole)
+        if len(one):  # from the normals that the row does not tell
+            rest = -np.vecmat(self.gain[one, choice, number], self.basis[one, choice])
             rest[:, : rows.shape[-1]] += rows[one, number]
             left[one, choice, number] = np.vecdot(rest, rest)
         mean = np.einsum("ij,ijn->in", shares, self.mean)
@@ -94,35 +87,59 @@ class Weighed(NamedTuple):
 
     def chosen(self, choice: np.ndarray) -> Gaussians:
         """The row taken in with one choice for each particle, shape (particles,)."""
-        every, p = np.arange(len(choice)), self.root.shape[-1]
-        seen = self.found.seen_rows[every, choice]
-        rows = np.zeros((len(choice), p + len(self.kept), seen.shape[-1]))
-        rows[:, :p], rows[:, p:, : self.found.rows.shape[-1]] = seen, self.found.rows[:, self.kept]
+        every = np.arange(len(choice))
+        seen, below = self.found.seen_rows[every, choice], self.found.rows
+        p, k = seen.shape[-2], below.shape[-1]
+        rows = np.zeros((len(choice), p + below.shape[-2], seen.shape[-1]))
+        rows[:, :p], rows[:, p:, :k] = seen, below
         made = condition_many(rows, p)
         return Gaussians(self.layout, self.mean[every, choice], made.factor, None)
 
 
-def weighed(layout: Layout, pattern: Pattern, found: Expected, row: np.ndarray) -> Weighed | None:
-    """The row's predictive density by every choice; None where some of it is certain given the rest of it.
+def weighed(layout: Layout, found: Expected, row: np.ndarray) -> Weighed | None:
+    """The row's predictive density by every choice; None where some of it may follow from the rest of it.
 
     Parameters
     ----------
     layout : Layout
         Without plates apart.
-    pattern : Pattern
-        Of a row that is seen in full.
     row : ndarray, shape (p,)
+        Seen in full.
     """
-    p, kept = layout.p, pattern.kept - layout.p
-    made = condition_many(found.seen_rows, p)
-    if made.certain is not None:
+    made = _orthonormal(found.seen_rows)
+    if made is None:
         return None
+    basis, root = made
     off = row - found.seen
     if layout.angles is not None:
-        off = np.where(layout.angles[:p], wrap_angle(off), off)
-    eta = standardised(made.root, off)
-    rows = found.rows[:, kept]
-    cross = rows[:, None] @ found.seen_rows[..., : rows.shape[-1]].swapaxes(-1, -2)
-    gain = solve_lower(made.root[:, :, None], cross)
-    mean = found.mean[:, None, kept] + np.matvec(gain, eta)
-    return Weighed(layout, kept, found, log_densities(made.root, eta), gain, made.root, mean)
+        off = np.where(layout.angles[: layout.p], wrap_angle(off), off)
+    eta = standardised(root, off)
+    gain = found.rows[:, None] @ basis[..., : found.rows.shape[-1]].swapaxes(-1, -2)
+    mean = found.mean[:, None] + np.matvec(gain, eta)
+    return Weighed(layout, found, log_densities(root, eta), basis, gain, mean)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _orthonormal(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Rows as ``root @ basis``: a lower triangle, and orthonormal rows; None where some may be combinations.
+
+    By Gram and Schmidt, twice for each row, which is as good as reflections (Giraud, Langou, Rozloznik and
+    van den Eshof 2005, Numerische Mathematik 101), and few operations on large arrays where p is small.
+    """
+    p = rows.shape[-2]
+    basis, root = rows.copy(), np.zeros((*rows.shape[:-1], p))
+    for i in range(p):
+        own, before = basis[..., i, :], basis[..., :i, :]
+        size = np.sqrt(np.vecdot(own, own))
+        for _ in range(2 if i else 0):
+            part = np.matvec(before, own)
+            own -= np.vecmat(part, before)
+            root[..., i, :i] += part
+        left = np.sqrt(np.vecdot(own, own))
+        if not (left > _CERTAIN * size).all():
+            return None
+        root[..., i, i] = left
+        own /= left[..., None]
+    return basis, root

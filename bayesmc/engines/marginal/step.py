@@ -248,12 +248,12 @@ class MarginalStep(FilterStep):
         There are no coefficients where the choices were weighed together.
         """
         pattern, target, given = seen_of(place.layout, row)
-        plain = given is None and not place.layout.lead and not self.lag and place.layout.p
-        if plain and isinstance(place.reader, LinearisedReader):
-            told = choices.expected(known, row, place.reader.at(inner))
-            found = told and weighed(place.layout, pattern, told[1], target)
-            if told and found:
-                return told[0] + found.log, found, None
+        together = given is None and not place.layout.lead and not self.lag and place.layout.p > 0
+        if together and isinstance(place.reader, LinearisedReader):
+            ahead = choices.expected(known, row, place.reader.at(inner))
+            each = None if ahead is None else weighed(place.layout, ahead[1], target)
+            if ahead is not None and each is not None:
+                return ahead[0] + each.log, each, None
         prior, coefficients = choices.read(known, row, place.reader.at(inner))
         made = take_in(place.layout, pattern, inner, coefficients, target, given)
         return prior + made.log, made, coefficients
