@@ -35,7 +35,7 @@ FAULTS = {
         Edit(
             STEP + "_taken",
             "log + own, after._replace(",
-            "log + made.log.mean(axis=1), after._replace(",
+            "log + each.log.mean(axis=1), after._replace(",
         ),
         "optimal",
     ),

@@ -337,7 +337,7 @@ MUTANTS = [
     Mutant(
         "finite nodes drawn given the row are not weighed by p/q",
         (Edit("bayesmc.engines.marginal.step:MarginalStep._taken",
-              "log + own, after._replace(", "log + made.log.mean(axis=1), after._replace("),),
+              "log + own, after._replace(", "log + each.log.mean(axis=1), after._replace("),),
         evidence_of(driven, MILD, OPTIMAL, 150),
         "unbiased_evidence_test, 150 runs of 30 particles",
     ),

@@ -40,18 +40,19 @@ def extended(seed: int) -> Verdict:
 
 
 BY = "repeated_test against ExtendedKalmanFilter"
-WHERE = "bayesmc.engines.marginal.linearised:LinearisedReader._linearised"
+WHERE = "bayesmc.engines.marginal.linearised:LinearisedReader."
 MUTANTS = [
     Mutant(
         "derivatives are taken where the slice before was, not where this one is expected",
-        (Edit(WHERE, "level.tangents(centre[..., part.reads])",
-              "level.tangents(centre[..., np.where(part.reads < n, part.reads, "
-              "(part.reads - n - layout.p) % max(n, 1))] if n else centre[..., part.reads])"),),
+        (Edit(WHERE + "_passed", "level.tangents(centre[..., part.reads])",
+              "(lambda n, p: level.tangents(centre[..., np.where(part.reads < n, part.reads, "
+              "(part.reads - n - p) % max(n, 1))] if n else centre[..., part.reads]))("
+              "self.layout.n_prev, self.layout.p)"),),
         extended, BY,
     ),
     Mutant(
         "a slice is linearised beside the mean of the one before",
-        (Edit(WHERE, "centre[..., :n] = mean", "centre[..., :n] = mean + 0.1"),),
+        (Edit(WHERE + "_begun", "centre[..., :n] = mean", "centre[..., :n] = mean + 0.1"),),
         extended, BY,
     ),
     Mutant(
