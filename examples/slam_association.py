@@ -42,6 +42,7 @@ from examples.slam_landmarks import (
     best_way,
     fast_slam,
     instants,
+    landmarks_of,
     log,
     one_by_one,
     share_near,
@@ -131,32 +132,18 @@ def draw(drive: Drive, readings: Readings, found: Any, numbers: np.ndarray, othe
     ax.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     ax.set(xlabel="x in m", ylabel="y in m", title="landmarks that were met, 2 sd, not turned")
     ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=9)
-    ax = panels["right"]
+    ax, heard = panels["right"], readings.which >= 0
     for name, own, colour in (
         ("Kalman filters", numbers, picture.OTHER),
         ("FastSLAM", other, picture.DRAWS),
     ):
-        share = _right_so_far(own, readings, len(drive.marks))
+        right = heard & (landmarks_of(own, readings, len(drive.marks)) == readings.which)
+        share = np.cumsum(right) / np.maximum(np.cumsum(heard), 1)
         ax.plot(readings.times, share, color=colour, lw=1.4, label=name)
     ax.set(xlim=(0, readings.times[-1]), ylim=(0, 1.02), xlabel="s")
     ax.set_title("share of readings assigned right so far")
     ax.legend(frameon=False, loc="lower right")
     return figure
-
-
-def _right_so_far(numbers: np.ndarray, readings: Readings, marks: int) -> np.ndarray:
-    """Numbers stand for the landmarks that they do in the whole record, one to one."""
-    from scipy.optimize import linear_sum_assignment
-
-    heard = readings.which >= 0
-    some = heard & (numbers >= 0)
-    counts = np.zeros((PLACES, marks))
-    np.add.at(counts, (numbers[some], readings.which[some]), 1)
-    meaning = np.full(PLACES + 1, -1)  # the last is of no landmark
-    rows, columns = linear_sum_assignment(-counts)
-    meaning[rows] = columns
-    right = heard & (meaning[numbers] == readings.which)
-    return np.cumsum(right) / np.maximum(np.cumsum(heard), 1)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -487,13 +487,20 @@ def _counts(numbers: np.ndarray, readings: Readings, marks: int) -> np.ndarray:
     return counts
 
 
-def share_right(numbers: np.ndarray, readings: Readings, marks: int) -> float:
-    """Of readings, the share whose landmark is right: numbers are matched one to one with landmarks."""
+def landmarks_of(numbers: np.ndarray, readings: Readings, marks: int) -> np.ndarray:
+    """The landmark that each reading was assigned to, -1 for none; numbers match landmarks one to one."""
     from scipy.optimize import linear_sum_assignment
 
-    counts = _counts(numbers, readings, marks)
-    rows, columns = linear_sum_assignment(-counts)
-    return float(counts[rows, columns].sum() / (readings.which >= 0).sum())
+    meaning = np.full(PLACES + 1, -1)  # the last is of no landmark
+    rows, columns = linear_sum_assignment(-_counts(numbers, readings, marks))
+    meaning[rows] = columns
+    return meaning[numbers]
+
+
+def share_right(numbers: np.ndarray, readings: Readings, marks: int) -> float:
+    """Of readings, the share whose landmark is right."""
+    heard = readings.which >= 0
+    return float((landmarks_of(numbers, readings, marks) == readings.which)[heard].mean())
 
 
 def share_near(numbers: np.ndarray, readings: Readings, marks: np.ndarray) -> float:

@@ -114,11 +114,13 @@ class Choices:
         self, values: Values, row: Row, reader: LinearisedReader
     ) -> tuple[np.ndarray, Expected] | None:
         """As `read`, where of all numbers only what is seen depends on the choice; else None."""
+        if self._seen_alone is False:
+            return None
         both = self._with_choices(values, None)
         if self._seen_alone is None:
             self._seen_alone = reader.seen_alone(self.names, both)
-        if not self._seen_alone:
-            return None
+            if not self._seen_alone:
+                return None
         log = self._log_factors(dict(both), row).reshape(values.particles, self.count)
         return log, reader.expected(values.at(None), both, self.count)
 
